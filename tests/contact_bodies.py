@@ -75,5 +75,5 @@ def dished_insert(height, half_x=15e-3, half_z=15e-3, spacing=0.5e-3):
 
 
 def flat_insert(height, half_x=15e-3, half_z=15e-3):
-    """Return a box of that height on y = 0."""
+    """Return a box of a height (m) on y = 0."""
     return dished_insert(lambda x, z: height + 0 * x, half_x, half_z, spacing=2 * half_x)

@@ -66,9 +66,9 @@ def recorded_solutions():
 
 
 def difference(state, solution, result):
-    """Return the largest difference between reported and recomputed residuals.
+    """Return the larger of the errors of the reported force and gap residuals.
 
-    Force and gap residuals are compared separately, as forces relative to the load.
+    The errors are scaled from the norm of the nodal forces to the load.
     """
     expected, size = recomputed(state, solution, result.pose), np.linalg.norm(result.nodal_force)
     measured = solution.residual.force, solution.residual.gap

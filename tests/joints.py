@@ -42,14 +42,18 @@ def bundles(ends=(), stiffness=1e5):
     )
 
 
-def demand(external, released=ALL, ligaments=None):
-    """Return the equations of a joint with an external wrench; a moment balances flexion."""
-    rows = released_indices(released)
+def joint_equations(external, released=ALL, ligaments=None):
+    """Return the equilibrium of a joint under an external wrench; a moment balances flexion."""
+    indices = released_indices(released)
     keeping = [
-        unit_residual(name, np.zeros(3)) for i, name in enumerate(KNEE_COORDINATES) if i not in rows
+        unit_residual(name, np.zeros(3))
+        for i, name in enumerate(KNEE_COORDINATES)
+        if i not in indices
     ]
-    chosen = bundles() if ligaments is None else ligaments
-    return JointEquilibrium(np.asarray(external, float), chosen, None, np.array(keeping).T, rows)
+    bundle_arrays = bundles() if ligaments is None else ligaments
+    return JointEquilibrium(
+        np.asarray(external, float), bundle_arrays, None, np.array(keeping).T, indices
+    )
 
 
 def push(force, point=(0.0, 0.0, 0.0)):
@@ -57,14 +61,14 @@ def push(force, point=(0.0, 0.0, 0.0)):
     return np.concatenate([force, np.cross(point, force)])
 
 
-def settle(model, state, external, start, released=ALL, ligaments=None):
+def find_equilibrium(model, state, external, start, released=ALL, ligaments=None):
     """Return coordinates (6,), contact and balance of a joint in equilibrium."""
-    asked = demand(external, released, ligaments)
-    forces = ReleasedForces(asked, model.probe(state), np.asarray(start, float))
+    joint = joint_equations(external, released, ligaments)
+    forces = ReleasedForces(joint, model.probe(state), np.asarray(start, float))
     balance = forces.balance()
     return forces.at(balance), forces.contact(balance), balance
 
 
-def apart(one, other):
+def distance_between(one, other):
     """Return the distance of two coordinates (6,), m; rotations times the lever arm."""
     return float(np.abs((np.asarray(one) - other) * SCALE).max())

@@ -30,7 +30,7 @@ needs_jw = pytest.mark.skipif(not JW.is_dir(), reason="subject JW is absent from
 class Gait:
     """A trial: motion of the model, and side -> ground reaction.
 
-    `loads` are the same reactions as wrenches at ground's origin, by body.
+    `loads` are body -> the same reactions as wrenches at ground's origin.
     """
 
     kinematics: Kinematics

@@ -31,13 +31,13 @@ def mirrored_inertia(inertia):
     return pin.Inertia(inertia.mass, MIRROR @ inertia.lever, MIRROR @ inertia.inertia @ MIRROR)
 
 
-def same(value):
+def unchanged(value):
     return value
 
 
 @dataclass
 class Body:
-    """A whole body with the leg. It converts states of the plain chain to its own states."""
+    """A whole body with the leg. `state` converts states of the plain chain."""
 
     model: pin.Model
     knee: tkamb.Knee
@@ -46,18 +46,18 @@ class Body:
 
     def state(self, q, v, a, external):
         """Return q, v, a and external forces of the body for those of the plain chain."""
-        turn = mirrored_se3 if self.left else same
-        flip = mirrored_spatial if self.left else same
+        turn = mirrored_se3 if self.left else unchanged
+        flip = mirrored_spatial if self.left else unchanged
         plain, data = self.plain, self.plain.model.createData()
         pin.forwardKinematics(plain.model, data, q, v, a)
         anatomy = plain.anatomy
         pose, twist, rate = {}, {}, {}
         for name in ("tibia", "femur", "patella"):
-            place = getattr(anatomy, name)
-            pose[name] = UPRIGHT * turn(data.oMi[place.joint] * place.placement)
+            fixed_frame = getattr(anatomy, name)
+            pose[name] = UPRIGHT * turn(data.oMi[fixed_frame.joint] * fixed_frame.placement)
             twist[name], rate[name] = (
-                pin.Motion(flip(place.placement.actInv(moved[place.joint]).vector))
-                for moved in (data.v, data.a)
+                pin.Motion(flip(fixed_frame.placement.actInv(derivative[fixed_frame.joint]).vector))
+                for derivative in (data.v, data.a)
             )
         model = self.model
         q2, v2, a2 = (
@@ -67,38 +67,45 @@ class Body:
         )
         rng = np.random.default_rng(4)
         v2[:], a2[:] = 0.3 * rng.standard_normal(model.nv), rng.standard_normal(model.nv)
-        where = {n: model.joints[model.getJointId(n)] for n in model.names if n != "universe"}
-        root, hip, knee = where["root_joint"], where["hip_ball"], where["knee_free"]
-        ankle = where["ankle_hinge"]
+        joints = {n: model.joints[model.getJointId(n)] for n in model.names if n != "universe"}
+        root, hip, knee = joints["root_joint"], joints["hip_ball"], joints["knee_free"]
+        ankle = joints["ankle_hinge"]
         q2[ankle.idx_q] = v2[ankle.idx_v] = a2[ankle.idx_v] = 0.0
-        # the pose of the pelvis that gives the thigh its pose
+        # pose of the pelvis from the pose of the thigh
         turn_hip = pin.SE3(pin.Quaternion(q2[hip.idx_q : hip.idx_q + 4]).matrix(), np.zeros(3))
         hip_id, thigh = model.getJointId("hip_ball"), model.frames[model.getFrameId("thigh_x")]
         to_thigh = model.jointPlacements[hip_id] * turn_hip * thigh.placement
         q2[root.idx_q : root.idx_q + 7] = pin.SE3ToXYZQUAT(pose["femur"] * to_thigh.inverse())
-        spin, more = np.zeros(6), np.zeros(6)
-        spin[3:], more[3:] = v2[hip.idx_v :][:3], a2[hip.idx_v :][:3]
-        s, ds = (thigh.placement.actInv(pin.Motion(x)) for x in (spin, more))
-        v_root = to_thigh.act(twist["femur"] - s)
-        a_root = to_thigh.act(rate["femur"] - ds - twist["femur"].cross(s))
+        spin, spin_rate = np.zeros(6), np.zeros(6)
+        spin[3:], spin_rate[3:] = v2[hip.idx_v :][:3], a2[hip.idx_v :][:3]
+        relative_twist, relative_rate = (
+            thigh.placement.actInv(pin.Motion(x)) for x in (spin, spin_rate)
+        )
+        v_root = to_thigh.act(twist["femur"] - relative_twist)
+        a_root = to_thigh.act(rate["femur"] - relative_rate - twist["femur"].cross(relative_twist))
         v2[root.idx_v :][:6], a2[root.idx_v :][:6] = v_root.vector, a_root.vector
-        for joint, name in ((knee, "tibia"), (where["cap_free"], "patella")):
+        for joint, name in ((knee, "tibia"), (joints["cap_free"], "patella")):
             relative = pose["femur"].actInv(pose[name])
-            s = twist[name] - relative.actInv(twist["femur"])
-            ds = rate[name] - relative.actInv(rate["femur"]) - twist[name].cross(s)
+            relative_twist = twist[name] - relative.actInv(twist["femur"])
+            relative_rate = (
+                rate[name] - relative.actInv(rate["femur"]) - twist[name].cross(relative_twist)
+            )
             q2[joint.idx_q :][:7] = pin.SE3ToXYZQUAT(relative)
-            v2[joint.idx_v :][:6], a2[joint.idx_v :][:6] = s.vector, ds.vector
+            v2[joint.idx_v :][:6], a2[joint.idx_v :][:6] = (
+                relative_twist.vector,
+                relative_rate.vector,
+            )
         forces = [pin.Force.Zero() for _ in range(model.njoints)]
-        place = anatomy.tibia
-        load = place.placement.actInv(external[place.joint])
+        fixed_frame = anatomy.tibia
+        ground = fixed_frame.placement.actInv(external[fixed_frame.joint])
         ankle_id = model.getJointId("ankle_hinge")
-        forces[ankle_id] = model.jointPlacements[ankle_id].actInv(pin.Force(flip(load.vector)))
+        forces[ankle_id] = model.jointPlacements[ankle_id].actInv(pin.Force(flip(ground.vector)))
         return q2, v2, a2, pin.StdVec_Force(forces)
 
 
 def whole_body(plain, left=False, leg_first=False):
     """Return the sample humanoid with the leg of a plain chain's knee."""
-    turn, weigh = (mirrored_se3, mirrored_inertia) if left else (same, same)
+    turn, weigh = (mirrored_se3, mirrored_inertia) if left else (unchanged, unchanged)
     anatomy, user = plain.anatomy, plain.model
     model = pin.Model() if leg_first else pin.buildSampleModelHumanoid()
     if leg_first:
@@ -107,25 +114,31 @@ def whole_body(plain, left=False, leg_first=False):
         root = model.getJointId("root_joint")
     hip = turn(pin.SE3(np.eye(3), (anatomy.hip.placement).translation))
     on_thigh = pin.SE3(pin.utils.rpyToMatrix(0.3, -0.2, 0.5), np.array([0.01, 0.02, -0.03]))
-    # the joint's frame is at the hip; the thigh's frame is rotated relative to it
+    # the joint's frame is at the hip; the thigh's frame is shifted
     thigh = hip.inverse()
     ball = model.addJoint(
         root, pin.JointModelSpherical(), pin.SE3(np.eye(3), np.array([0, 0.1, -0.1])), "hip_ball"
     )
-    place = anatomy.femur
-    own = user.inertias[place.joint].se3Action(place.placement.inverse())
-    model.appendBodyToJoint(ball, weigh(own), thigh)
+    femur = anatomy.femur
+    inertia = user.inertias[femur.joint].se3Action(femur.placement.inverse())
+    model.appendBodyToJoint(ball, weigh(inertia), thigh)
     frame(model, "thigh_x", ball, thigh)
     frame(model, "cup", ball, pin.SE3.Identity())
     cap = model.addJoint(ball, pin.JointModelFreeFlyer(), thigh, "cap_free")
-    own = user.inertias[anatomy.patella.joint].se3Action(anatomy.patella.placement.inverse())
-    model.appendBodyToJoint(cap, weigh(own), pin.SE3.Identity())
+    inertia = user.inertias[anatomy.patella.joint].se3Action(anatomy.patella.placement.inverse())
+    model.appendBodyToJoint(cap, weigh(inertia), pin.SE3.Identity())
     frame(model, "kneecap", cap, pin.SE3.Identity())
     shank = model.addJoint(ball, pin.JointModelFreeFlyer(), thigh, "knee_free")
     ankle = model.addJoint(shank, pin.JointModelRX(), on_thigh, "ankle_hinge")
-    whole = weigh(user.inertias[anatomy.tibia.joint].se3Action(anatomy.tibia.placement.inverse()))
-    rest = whole.toDynamicParameters() - FOOT.se3Action(on_thigh).toDynamicParameters()
-    model.appendBodyToJoint(shank, pin.Inertia.FromDynamicParameters(rest), pin.SE3.Identity())
+    shank_inertia = weigh(
+        user.inertias[anatomy.tibia.joint].se3Action(anatomy.tibia.placement.inverse())
+    )
+    shank_parameters = (
+        shank_inertia.toDynamicParameters() - FOOT.se3Action(on_thigh).toDynamicParameters()
+    )
+    model.appendBodyToJoint(
+        shank, pin.Inertia.FromDynamicParameters(shank_parameters), pin.SE3.Identity()
+    )
     model.appendBodyToJoint(ankle, FOOT, pin.SE3.Identity())
     frame(model, "calf", shank, pin.SE3.Identity())
     tray = turn(anatomy.tibia.placement.inverse() * plain.bridge.insert.placement)
@@ -150,14 +163,14 @@ def moved(point, left):
 
 
 def other_knee(plain, model, left, plane):
-    """Return the same knee on another model, its meshes as trimesh objects or arrays."""
+    """Return the same knee on another model, with meshes as trimesh objects or arrays."""
     surfaces = [plain.femoral, plain.insert, plain.button]
     if left:
-        surfaces = [mirrored_surface(one) for one in surfaces]
-    femoral, insert, button = ((one.vertices, one.faces) for one in surfaces)
+        surfaces = [mirrored_surface(item) for item in surfaces]
+    femoral, insert, button = ((item.vertices, item.faces) for item in surfaces)
     bundles = [
-        replace(one, proximal=moved(one.proximal, left), distal=moved(one.distal, left))
-        for one in plain.ligaments
+        replace(item, proximal=moved(item.proximal, left), distal=moved(item.distal, left))
+        for item in plain.ligaments
     ]
     muscle, line = plain.extensor.quadriceps, plain.extensor.patellar_ligament
     extensor = tkamb.Extensor(

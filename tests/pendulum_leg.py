@@ -65,7 +65,7 @@ def _joint(kind: str, name: str, parent: str, child: str, place: str, count: int
 
 
 def moving_leg(osim: Path, frames: int = 60) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return coordinates (n, 11) of a knee bend, and label -> marker positions (n, 3) in ground."""
+    """Return coordinates (n, 11) of a knee bend, and marker label -> positions (n, 3) m."""
     model = read_osim(osim)
     chain = ModelChain(model, list(model.markers))
     q = chain.default(frames)

@@ -172,11 +172,11 @@ def _refined(planes, step):
 
 
 def _shaped(random, surface, height, dished, symmetric, upright):
-    """Return the block with dishes if `dished`, with random slants of walls in a random pose."""
+    """Return the block with dishes if `dished`, random slants of its walls and a random pose."""
     points = surface.vertices.copy()
     half = np.abs(points[:, [0, 2]]).max(axis=0)
     share = points[:, 1] / height
-    if dished:  # two dishes, deepest in the middle of each side
+    if dished:  # two dishes, deepest in the middle of surface side
         u, v = points[:, 0] / half[0], (np.abs(points[:, 2]) - half[1] / 2) / (half[1] / 2)
         points[:, 1] *= 1.0 - 0.3 * np.maximum(1 - u**2, 0) * np.maximum(1 - v**2, 0)
     if upright:
@@ -244,6 +244,8 @@ def share_of_load(design: RandomInsert, contact: str = "lattice-linear") -> floa
 
 def joined_surfaces(*surfaces: Surface) -> Surface:
     """Return several surfaces as one, unmerged."""
-    first = np.cumsum([0, *(len(each.vertices) for each in surfaces[:-1])])
-    faces = [each.faces + start for each, start in zip(surfaces, first, strict=True)]
-    return Surface(np.concatenate([each.vertices for each in surfaces]), np.concatenate(faces))
+    first = np.cumsum([0, *(len(surface.vertices) for surface in surfaces[:-1])])
+    faces = [surface.faces + start for surface, start in zip(surfaces, first, strict=True)]
+    return Surface(
+        np.concatenate([surface.vertices for surface in surfaces]), np.concatenate(faces)
+    )

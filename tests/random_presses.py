@@ -26,8 +26,8 @@ def prepared(mm, tolerance=1e-3):
 def pose_of(rng):
     """Return a random pose near the neutral one."""
     x, z = rng.uniform([-2e-3, -1e-3], [2e-3, 1e-3])
-    turned = np.radians(rng.uniform([-0.5, -3.0, -5.0], [0.5, 3.0, 5.0]))
-    return knee_pose([x, 0.0, z, *turned])
+    angles = np.radians(rng.uniform([-0.5, -3.0, -5.0], [0.5, 3.0, 5.0]))
+    return knee_pose([x, 0.0, z, *angles])
 
 
 def presses(model, state, reference, reference_state, rng, cases):

@@ -93,8 +93,8 @@ def bicondylar(kind: str = "sphere", apart: float = 0.044) -> Surface:
 def nearest_on_triangles(triangles, points):
     """Return the point (n, 3) of each triangle (n, 3, 3) that is nearest to its point (n, 3).
 
-    It is the projection onto the triangle's plane if it lies inside the triangle, else the nearest
-    projection onto an edge. Without absolute tolerances it is correct for triangles of any size.
+    This point is the projection onto the triangle's plane if it lies inside the triangle, else the
+    nearest projection onto an edge. The result is correct for triangles of any size.
     """
     weights = _plane_weights(triangles, points)
     feet = np.einsum("ij,ijk->ik", weights, triangles)

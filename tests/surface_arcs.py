@@ -1,7 +1,7 @@
 """Lines on a surface: U and V splines with their normals, and arc lengths.
 
-A U line connects the points of a grid with the same z by a cubic spline y(x), a V line those with
-the same x by y(z). The tangents (1, y_x, 0) and (0, y_z, 1) span the tangent plane.
+A U line connects the points of a grid with the same z by a cubic spline y(x), a V line the points
+with the same x by y(z). The tangents (1, y_x, 0) and (0, y_z, 1) span the tangent plane.
 """
 
 from dataclasses import dataclass
@@ -86,13 +86,13 @@ def arc_lengths(surface: Surface, start: Array, end: Array, side: float = 1.0) -
     share = np.linspace(0.0, 1.0, count)
     samples = start[:, None] + share[:, None] * (end - start)[:, None]
     heights = _heights(surface, samples.reshape(-1, 3), side).reshape(len(start), count)
-    whole = np.isfinite(heights).all(axis=1)
+    complete = np.isfinite(heights).all(axis=1)
     lengths = np.full(len(start), np.nan)
-    if whole.any():
-        slope = CubicSpline(share, heights[whole], axis=1).derivative()
+    if complete.any():
+        slope = CubicSpline(share, heights[complete], axis=1).derivative()
         fine, weights = _gauss_points(share)
-        rate = np.hypot(across[whole, None], slope(fine))
-        lengths[whole] = rate @ weights
+        rate = np.hypot(across[complete, None], slope(fine))
+        lengths[complete] = rate @ weights
     return lengths
 
 

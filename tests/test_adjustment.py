@@ -103,16 +103,16 @@ def on_a_flank(depth: float) -> ClosestPointQuery:
     slope.apply_translation(centre - turn[:3, 1] * (RADIUS - depth + 0.002))
     flat = insert()
     mesh = trimesh.util.concatenate([trimesh.Trimesh(flat.vertices, flat.faces), slope])
-    whole = Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces), "insert")
-    return ClosestPointQuery(condyles(), whole, 0.0)
+    combined = Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces), "insert")
+    return ClosestPointQuery(condyles(), combined, 0.0)
 
 
-@pytest.mark.parametrize(("depth", "made"), [(1e-4, True), (2e-4, False)])
-def test_a_turn_above_the_limit_is_not_made(depth: float, made: bool) -> None:
+@pytest.mark.parametrize(("depth", "turned"), [(1e-4, True), (2e-4, False)])
+def test_a_turn_above_the_limit_is_not_made(depth: float, turned: bool) -> None:
     """A measured angle of 0.33 deg needs a turn of 0.6 deg, because one condyle is on a slope."""
     adjustment = adjust(on_a_flank(depth), tilted(0.0, HEIGHT))
     assert 0.2 < np.rad2deg(adjustment.measured_angle) < 0.4
-    assert (adjustment.coronal_angle != 0.0) is made
+    assert (adjustment.coronal_angle != 0.0) is turned
     assert abs(adjustment.coronal_angle) < np.deg2rad(0.5)
 
 
@@ -141,10 +141,10 @@ def test_the_move_is_at_most_half_a_millimetre(query: ClosestPointQuery, height:
 
 def test_angles_near_the_lift_off_limit_are_flagged(query: ClosestPointQuery) -> None:
     """0.1 mm at a condyle is 0.13 deg: angles within 0.13 deg of 0.5 deg are flagged."""
-    for angle, made, flagged in ((0.3, True, False), (0.45, True, True), (0.55, False, True),
+    for angle, turned, flagged in ((0.3, True, False), (0.45, True, True), (0.55, False, True),
                                  (0.7, False, False)):  # fmt: skip
         adjustment = adjust(query, tilted(angle))
-        assert (adjustment.coronal_angle != 0.0) is made
+        assert (adjustment.coronal_angle != 0.0) is turned
         assert any("limit" in flag for flag in adjustment.flags) is flagged
 
 
@@ -195,7 +195,7 @@ def test_deeper_press_restores_the_recorded_rotation(query: ClosestPointQuery) -
 
 
 def test_by_default_both_conditions_are_needed(query: ClosestPointQuery) -> None:
-    """The penetration exceeds the move, but both condyles have the same one: the turn stays."""
+    """The penetration exceeds the move but is equal at both condyles, so the turn stays."""
     result, adjustment = pressed(query, 0.3, 0.0, 2500.0)
     assert not adjustment.restored
     assert adjustment.penetration > abs(adjustment.translation)

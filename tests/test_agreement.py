@@ -77,10 +77,10 @@ def test_a_probe_of_a_result_equals_a_probe_at_its_pose():
     model = contact_model("foundation", 1.0)
     state = model.prepare(flat_joint())
     result = model.press(state, 1000.0, knee_pose(np.zeros(6)))
-    away = result.pose.copy()
-    away[:3, 3] += [5e-3, 2e-3, 0.0]
+    far_pose = result.pose.copy()
+    far_pose[:3, 3] += [5e-3, 2e-3, 0.0]
     probe = model.probe(state)
-    probe.at(away)
+    probe.at(far_pose)
     from_result, at_pose = probe.seen(result), model.probe(state).at(result.pose)
     assert set(from_result.condyles) == set(at_pose.condyles) == {"medial", "lateral"}
     for side, condyle in from_result.condyles.items():
@@ -116,8 +116,8 @@ def test_the_shipped_knee_has_no_contradiction_and_states_the_effect_of_half_a_d
     # At this coarse spacing the contact is too narrow for its columns; nothing else is flagged.
     parts = {part for status in shipped.status for part in status.split("; ")}
     assert all(part == "ok" or TOO_NARROW in part or "take finer" in part for part in parts)
-    moved = 0.5 * shipped["medial_force_per_adduction_N_per_deg"]
-    assert (moved > 0.25 * shipped["force_si_N"]).all()
+    shift = 0.5 * shipped["medial_force_per_adduction_N_per_deg"]
+    assert (shift > 0.25 * shipped["force_si_N"]).all()
     assert (shipped["split_determined"] == 0).all()
     assert shipped.summary["split_not_determined_frames"] == len(shipped)
     card = share_card(shipped)

@@ -30,7 +30,7 @@ def torus_dish(major=0.03, minor=0.02, spacing=5e-4):
     return raised(x, z, height(*np.meshgrid(x, z, indexing="ij")), solid), height
 
 
-def test_arc_length_on_a_cylinder():
+def test_arc_length_on_a_cylinder_agrees_with_quadrature():
     """An oblique section is an arc of an ellipse. Quadrature gives its exact length."""
     radius = 0.05
     surface = trough(radius, spacing=5e-4)
@@ -47,7 +47,7 @@ def test_arc_length_on_a_cylinder():
         assert length == pytest.approx(quad(rate, 0, 1)[0], rel=1e-3)
 
 
-def test_arc_length_on_a_planar_section_of_a_torus():
+def test_arc_length_on_a_section_of_a_torus_is_exact():
     surface, height = torus_dish()
     rng = np.random.default_rng(4)
     start = rng.uniform([-0.011, 0, -0.009], [-0.004, 0, 0.009], (12, 3))
@@ -61,14 +61,14 @@ def test_arc_length_on_a_planar_section_of_a_torus():
         assert length == pytest.approx(exact, rel=2e-3)
 
 
-def test_arc_length_from_below_and_off_the_surface():
+def test_arc_length_is_exact_from_below_and_nan_off_the_surface():
     surface = torus_condyle(0.025, 0.01, 0.0)
     below = arc_lengths(surface, [[-0.01, 0, 0]], [[0.01, 0, 0]], side=-1.0)
     assert below[0] == pytest.approx(2 * 0.025 * np.arcsin(0.4), rel=2e-3)
     assert np.isnan(arc_lengths(surface, [[-0.05, 0, 0]], [[0.01, 0, 0]])[0])
 
 
-def test_normals_of_uv_lines_on_a_paraboloid():
+def test_normals_of_uv_lines_on_a_paraboloid_are_exact():
     i, k = (v.ravel() for v in np.meshgrid(np.arange(15), np.arange(20), indexing="ij"))
     x, z = 1e-3 * i, 1e-3 * k
     points = np.column_stack([x, 20 * x**2 + 10 * x * z + 15 * z**2, z])
@@ -97,7 +97,7 @@ def test_lines_end_at_gaps_and_an_isolated_point_has_no_slope():
 
 
 @pytest.mark.parametrize("name", ["dm", "jw"])
-def test_normals_on_the_dishes_of_real_inserts(name):
+def test_normals_on_the_dishes_of_real_inserts_are_within_2_deg(name):
     insert = real_insert(name)
     lattice = build_grid(insert, 1e-3)
     nodes = lattice.contact_nodes

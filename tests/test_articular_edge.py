@@ -67,8 +67,8 @@ def test_the_edge_is_where_the_fillet_is_steep():
 
 def test_the_flank_of_an_eminence_is_not_an_edge():
     edge = ArticularEdge.of(with_eminence())
-    away = edge.distance(np.array([[0, 0, 0], [0, 0, 3 * MM], [0, 0, 8 * MM]]))
-    assert (away > 10 * MM).all()  # the ends of the ridge at the outline belong to the rim
+    distances = edge.distance(np.array([[0, 0, 0], [0, 0, 3 * MM], [0, 0, 8 * MM]]))
+    assert (distances > 10 * MM).all()  # the ends of the ridge at the outline belong to the rim
     assert not flags(with_eminence(), 0, 6 * MM, radius=8 * MM)
 
 

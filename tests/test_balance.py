@@ -12,13 +12,13 @@ from joints import (
     HALF,
     HEIGHT,
     LINEAR,
-    apart,
     bundles,
-    demand,
     dished_joint,
+    distance_between,
+    find_equilibrium,
     flat_joint,
+    joint_equations,
     push,
-    settle,
 )
 from tkamb.contact.foundation import LinearFoundation
 from tkamb.contact.model import Probe
@@ -57,9 +57,11 @@ def test_linear_springs_reach_their_equilibrium():
     root = rng.normal(size=(4, 4))
     stiffness = 1e5 * (root @ root.T + 0.1 * np.eye(4))
     load = rng.normal(size=4) * 20
-    for given in (True, False):
+    for with_stiffness in (True, False):
         end = find_balance(
-            lambda x, given=given: Trial(load - stiffness @ x, stiffness if given else None),
+            lambda x, with_stiffness=with_stiffness: Trial(
+                load - stiffness @ x, stiffness if with_stiffness else None
+            ),
             np.full(4, 1e-3),
         )
         assert end.status is BalanceStatus.OK
@@ -87,7 +89,7 @@ def hardening(guide=None):
 
 
 @pytest.mark.parametrize(
-    ("guide", "most"),
+    ("guide", "max_trials"),
     [
         (lambda tangent: 1.3 * tangent, 14),
         (lambda tangent: tangent + 1e6, 14),
@@ -95,7 +97,7 @@ def hardening(guide=None):
         (lambda tangent: -tangent, 100),
     ],
 )
-def test_an_inexact_stiffness_leads_to_the_same_equilibrium(guide, most):
+def test_an_inexact_stiffness_leads_to_the_same_equilibrium(guide, max_trials):
     """A tangent with an error of a third needs fewer trials than differences. With a wrong tangent
     the search converges, too.
     """
@@ -107,8 +109,8 @@ def test_an_inexact_stiffness_leads_to_the_same_equilibrium(guide, most):
         assert end.status is BalanceStatus.OK
         assert len(end.work) <= end.steps < end.trials
         assert end.coordinates == pytest.approx(equilibrium, abs=5e-8)
-    assert by_stiffness.trials <= most
-    assert most > 20 or by_stiffness.trials < by_differences.trials
+    assert by_stiffness.trials <= max_trials
+    assert max_trials > 20 or by_stiffness.trials < by_differences.trials
 
 
 def test_forces_without_a_potential_converge():
@@ -146,21 +148,27 @@ def test_an_inexact_stiffness_at_equilibrium_does_not_make_it_unstable():
 
 def test_constraint_forces_cancel_the_forces_on_prescribed_coordinates():
     external = push([30.0, LOAD, -40.0], [2e-3, 0, 5e-3])
-    joint = demand(external, ("adduction", "ap"))
-    place, contact = np.array([1e-3, TOUCH, -0.5e-3, 0.03, 0.002, 0.4]), push([5.0, -800.0, 9.0])
-    (residual,) = joint.whole(place[None], contact)
+    joint = joint_equations(external, ("adduction", "ap"))
+    coordinates, contact = (
+        np.array([1e-3, TOUCH, -0.5e-3, 0.03, 0.002, 0.4]),
+        push([5.0, -800.0, 9.0]),
+    )
+    (residual,) = joint.forces_on_all_coordinates(coordinates[None], contact)
     assert np.abs(np.delete(residual, joint.released)).max() < 1e-10
     assert residual[list(joint.released)] == pytest.approx(
-        joint.imbalance(place, contact), abs=1e-9
+        joint.residual(coordinates, contact), abs=1e-9
     )
 
 
 def test_contact_gain_is_the_derivative_of_the_residual():
-    joint = demand(push([30.0, LOAD, -40.0], [2e-3, 0, 5e-3]), ("adduction", "ap"))
-    place, contact = np.array([1e-3, TOUCH, -0.5e-3, 0.03, 0.002, 0.4]), push([5.0, -800.0, 9.0])
-    steps = np.stack([joint.imbalance(place, contact + unit) for unit in np.eye(6)], axis=1)
-    change = steps - joint.imbalance(place, contact)[:, None]
-    assert joint.contact_gain(place) == pytest.approx(change, abs=1e-9)
+    joint = joint_equations(push([30.0, LOAD, -40.0], [2e-3, 0, 5e-3]), ("adduction", "ap"))
+    coordinates, contact = (
+        np.array([1e-3, TOUCH, -0.5e-3, 0.03, 0.002, 0.4]),
+        push([5.0, -800.0, 9.0]),
+    )
+    steps = np.stack([joint.residual(coordinates, contact + unit) for unit in np.eye(6)], axis=1)
+    change = steps - joint.residual(coordinates, contact)[:, None]
+    assert joint.contact_gain(coordinates) == pytest.approx(change, abs=1e-9)
 
 
 def test_an_initial_guess_at_the_end_of_the_range_is_out_of_range():
@@ -260,7 +268,7 @@ def test_the_stiffness_of_the_released_coordinates_is_the_slope_of_their_forces(
     external = push([30.0, LOAD, -40.0], [2e-3, 0, 5e-3])
     strap = bundles([([0, 0, -35e-3], [0, -30e-3, -35e-3], 60e-3)])
     place = np.array([1e-3, TOUCH - 0.05e-3, -0.5e-3, 0.03, 0.002, 0.4])
-    forces = ReleasedForces(demand(external, ligaments=strap), model.probe(state), place)
+    forces = ReleasedForces(joint_equations(external, ligaments=strap), model.probe(state), place)
     x = (place * SCALE)[:5]
     stiffness = forces.trial(x).stiffness
     for i in range(5):
@@ -278,7 +286,7 @@ def test_split_and_tilt_follow_the_adduction_moment(flat, share):
     d_l)/(2b).
     """
     offset = share * HALF
-    place, contact, balance = settle(
+    place, contact, balance = find_equilibrium(
         *flat, push([0, LOAD, 0], [0, 0, offset]), [0, TOUCH, 0, 0, 0, 0.3], ("adduction",)
     )
     assert balance.status is BalanceStatus.OK
@@ -287,8 +295,8 @@ def test_split_and_tilt_follow_the_adduction_moment(flat, share):
     assert contact.condyles["lateral"].force == pytest.approx(lateral, abs=0.5)
     tilt = (sphere_depth(medial) - sphere_depth(lateral)) / (2 * HALF)
     assert place[4] == pytest.approx(tilt, abs=0.02 * sphere_depth(LOAD) / HALF)
-    sunk = HEIGHT + BALL - place[1]
-    assert sunk == pytest.approx((sphere_depth(lateral) + sphere_depth(medial)) / 2, rel=0.03)
+    approach = HEIGHT + BALL - place[1]
+    assert approach == pytest.approx((sphere_depth(lateral) + sphere_depth(medial)) / 2, rel=0.03)
 
 
 def test_a_condyle_lifts_off_at_zero_force_and_lands_again(flat):
@@ -306,12 +314,14 @@ def test_a_condyle_lifts_off_at_zero_force_and_lands_again(flat):
     place, states = np.array([0, TOUCH, 0, 0, 0, 0.3]), []
     for share in up:
         external = push([0, LOAD, 0], [0, 0, share * HALF])
-        place, contact, balance = settle(model, state, external, place, ("adduction",), strap)
+        place, contact, balance = find_equilibrium(
+            model, state, external, place, ("adduction",), strap
+        )
         assert balance.status is BalanceStatus.OK
         assert min(balance.work, default=1.0) > 0
         tension = np.linalg.norm(strap.wrench(knee_pose(place))[:3])
-        carried = {side: c.wrench[1] for side, c in contact.condyles.items()}
-        assert max(carried.values()) < 0
+        vertical_forces = {side: c.wrench[1] for side, c in contact.condyles.items()}
+        assert max(vertical_forces.values()) < 0
         states.append((share, place, "medial" in contact.condyles, tension))
     for share, _, medial, tension in states:
         slackened = tension < 1e-9
@@ -321,36 +331,38 @@ def test_a_condyle_lifts_off_at_zero_force_and_lands_again(flat):
             assert tension == pytest.approx(expected, rel=0.02, abs=0.5)
     assert any(not medial for *_, medial, _ in states)
     for (_, loading, *_), (_, unloading, *_) in zip(states, states[::-1], strict=True):
-        assert apart(loading, unloading) < 5e-6
+        assert distance_between(loading, unloading) < 5e-6
 
 
 def test_a_knee_without_constraints_is_indeterminate(flat):
     external = push([0, LOAD, 0])
     start = [0, TOUCH, 0, 0, 0, 0.3]
-    *_, balance = settle(*flat, external, start)
+    *_, balance = find_equilibrium(*flat, external, start)
     assert balance.status is BalanceStatus.INDETERMINATE
-    *_, balance = settle(*flat, push([20.0, LOAD, 0]), start)
+    *_, balance = find_equilibrium(*flat, push([20.0, LOAD, 0]), start)
     assert balance.status is BalanceStatus.RUNS_AWAY
-    *_, balance = settle(*flat, push([0, LOAD, 0], [0, 0, 1.5 * HALF]), start, ("adduction",))
+    *_, balance = find_equilibrium(
+        *flat, push([0, LOAD, 0], [0, 0, 1.5 * HALF]), start, ("adduction",)
+    )
     assert balance.status is not BalanceStatus.OK
 
 
 # Two spheres in two dishes
 
 
-@pytest.mark.parametrize("aside", [(0.0, 0.0), (0.2, 0.0), (0.0, 0.15)])
-def test_spheres_in_dishes_follow_the_direction_of_the_load(dished, aside):
+@pytest.mark.parametrize("inclination", [(0.0, 0.0), (0.2, 0.0), (0.0, 0.15)])
+def test_spheres_in_dishes_follow_the_direction_of_the_load(dished, inclination):
     """The centre of a sphere moves like a pendulum of length R_dish - R_ball + depth."""
-    force = np.array([aside[0] * LOAD, LOAD, aside[1] * LOAD])
+    force = np.array([inclination[0] * LOAD, LOAD, inclination[1] * LOAD])
     level = np.array([0, HEIGHT + BALL, 0])
-    place, contact, balance = settle(
+    place, contact, balance = find_equilibrium(
         *dished, push(force, level), [0, TOUCH, 0, 0, 0, 0.3], ("ap", "ml")
     )
     assert balance.status is BalanceStatus.OK
     assert min(balance.work, default=1.0) > 0
     depth = sphere_depth(LOAD / 2)
-    hanging = -(DISH - BALL + depth) * force / np.linalg.norm(force)
-    assert np.allclose(place[[0, 2]], hanging[[0, 2]], atol=2e-4)
+    expected = -(DISH - BALL + depth) * force / np.linalg.norm(force)
+    assert np.allclose(place[[0, 2]], expected[[0, 2]], atol=2e-4)
     assert contact.wrench[0] == pytest.approx(-force[0], abs=0.1)
 
 
@@ -361,15 +373,15 @@ STARTS = [
 ]
 
 
-@pytest.mark.parametrize("away", STARTS)
-def test_initial_guesses_5_mm_and_5_deg_away_reach_the_same_equilibrium(dished, away):
+@pytest.mark.parametrize("offset", STARTS)
+def test_initial_guesses_5_mm_and_5_deg_away_reach_the_same_equilibrium(dished, offset):
     external = push([40.0, LOAD, -30.0], [1e-3, 0, 4e-3])
-    home = np.array([0, TOUCH, 0, 0, 0, 0.3])
-    near, _, first = settle(*dished, external, home)
-    far, contact, balance = settle(*dished, external, home + np.append(away, 0.0))
+    neutral = np.array([0, TOUCH, 0, 0, 0, 0.3])
+    near, _, first = find_equilibrium(*dished, external, neutral)
+    far, contact, balance = find_equilibrium(*dished, external, neutral + np.append(offset, 0.0))
     assert first.status is BalanceStatus.OK
     assert balance.status is BalanceStatus.OK
-    assert apart(near, far) < 1e-5
+    assert distance_between(near, far) < 1e-5
     assert min(balance.work) > 0
     assert len(contact.condyles) == 2
 
@@ -408,7 +420,7 @@ def test_every_contact_model_reaches_equilibrium(name, resolution_mm):
     state = model.prepare(dished_joint())
     external = push([20.0, LOAD, 0], [0, 0, 2e-3])
     start = [0.3e-3, TOUCH, -0.3e-3, 0.01, 0, 0.3]
-    place, contact, balance = settle(model, state, external, start)
+    place, contact, balance = find_equilibrium(model, state, external, start)
     assert balance.status is BalanceStatus.OK
     assert np.allclose(contact.wrench[:3], [-20, -LOAD, 0], atol=0.2)
     assert contact.condyles["lateral"].force > contact.condyles["medial"].force

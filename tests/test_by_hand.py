@@ -73,7 +73,7 @@ def test_external_moments_are_force_times_lever(frame, force, lever):
 
 
 def test_a_ground_force_medial_of_the_knee_adducts_and_one_behind_it_flexes(frame):
-    """Medial is -z, posterior is -x. 100 N have a moment of 5 N·m at 5 cm, 8 N·m at 8 cm."""
+    """Medial is -z, posterior is -x. 100 N have a moment of 5 N·m at 5 cm and 8 N·m at 8 cm."""
     origin = frame.geometry.state.pose("femur")[:3, 3]
     before = frame.loads
     up = np.array([0.0, 100.0, 0.0])
@@ -87,7 +87,7 @@ def test_a_ground_force_medial_of_the_knee_adducts_and_one_behind_it_flexes(fram
     assert behind.external_flexion - before.external_flexion == pytest.approx(8.0, rel=0.02)
 
 
-def test_sensitivity_is_the_difference_when_the_residuals_act_elsewhere(frame, monkeypatch):
+def test_sensitivity_is_the_change_of_force_with_the_point_of_the_residuals(frame, monkeypatch):
     geometry = frame.geometry
     total = np.linalg.norm(solve_knee(geometry, FRICTION).contact_force)
     changes = []
@@ -110,16 +110,16 @@ def test_columns_of_area_and_pressure_have_the_units_of_their_names(results, sid
     """The map gives the triangles' area (mm²), the nodes' pressure (MPa) and the force (N)."""
     maps = results.maps
     corners = maps.points_m[maps.triangles]
-    twice = np.linalg.norm(
+    parallelogram_area = np.linalg.norm(
         np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
     )
-    owned = np.zeros(len(maps.points_m))
-    np.add.at(owned, maps.triangles, (twice / 6.0)[:, None])
+    nodal_area = np.zeros(len(maps.points_m))
+    np.add.at(nodal_area, maps.triangles, (parallelogram_area / 6.0)[:, None])
     for k, pressure in enumerate(maps.pressure_Pa):
         inverse = np.linalg.inv(maps.femoral_pose[k])
         across = (maps.points_m @ inverse[2, :3]) + inverse[2, 3]
-        own = (pressure > 0) & ((across < 0.0) == (side == "medial"))
-        area, peak = owned[own].sum() * 1e6, pressure[own].max() / 1e6
+        loaded = (pressure > 0) & ((across < 0.0) == (side == "medial"))
+        area, peak = nodal_area[loaded].sum() * 1e6, pressure[loaded].max() / 1e6
         assert results[f"{side}_area_mm2"][k] == pytest.approx(area, rel=0.03)
         assert results[f"{side}_peak_pressure_MPa"][k] == pytest.approx(peak, rel=1e-9)
         mean, force = results[f"{side}_mean_pressure_MPa"][k], results[f"{side}_force_N"][k]
@@ -147,8 +147,8 @@ def test_the_source_s_rule_divides_by_the_overlap_of_the_undeformed_bodies():
     loaded = result.pressure > 0
     assert result.area[loaded].sum() == pytest.approx(overlap, rel=0.06)
     vertical = -result.nodal_force[loaded] @ [0.0, 1.0, 0.0]
-    wanted = vertical * loaded.sum() / overlap
-    np.testing.assert_allclose(result.pressure[loaded], wanted, rtol=0.07)
+    expected = vertical * loaded.sum() / overlap
+    np.testing.assert_allclose(result.pressure[loaded], expected, rtol=0.07)
 
 
 def test_friction_opposes_the_sliding_of_the_femur():

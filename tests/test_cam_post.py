@@ -102,7 +102,7 @@ def test_the_post_is_divided_from_the_dishes_and_both_stay_closed(insert, parts)
         assert part.mesh.is_winding_consistent
         assert part.mesh.body_count == 1
     before_front = insert.mesh.volume - dishes.mesh.volume - post.mesh.volume
-    depth = 2.4e-3  # of the draft that is cut off in front
+    depth = 2.4e-3  # m, draft that is cut off in front
     assert 0 < before_front < depth * np.prod(np.ptp(post.vertices, axis=0)[1:])
     assert np.ptp(dishes.vertices, axis=0) == pytest.approx([0.0478, 0.0197, 0.074], abs=2e-4)
     assert post.vertices[:, 1].max() == pytest.approx(25e-3, abs=1e-9)
@@ -127,9 +127,9 @@ def test_the_division_does_not_change_the_contact_of_the_condyles(
     for body in (insert, dishes):
         state = chosen.prepare(ContactPair(femoral, body, CURVED))
         wrenches.append(chosen.evaluate(state, pose).wrench_on_insert)
-    apart = CamPost(chosen, femoral, post, 0.0, CURVED).at(pose)
-    assert (apart.force == 0).all()
-    assert apart.gap > 5e-3
+    post_contact = CamPost(chosen, femoral, post, 0.0, CURVED).at(pose)
+    assert (post_contact.force == 0).all()
+    assert post_contact.gap > 5e-3
     assert wrenches[0][1] < -500
     change = np.abs(wrenches[1] - wrenches[0]) / np.array([1.0, 1.0, 1.0, *[0.025] * 3])
     assert change.max() < tolerance * -wrenches[0][1]
@@ -306,7 +306,7 @@ def test_without_friction_the_equations_get_the_wrench_of_the_pair(knee):
 def test_a_recorded_overlap_is_flagged_and_a_deep_one_fails(knee):
     contact = knee().frame(59)[1]
     assert contact.post.gap < -0.5e-3
-    assert any("release ap" in flag for flag in contact.post.flags)
+    assert any("add 'ap' to [contact] released" in flag for flag in contact.post.flags)
     body, contact = knee().frame(70)
     assert contact.result is None
     assert "cam-post contact out of range" in contact.problem

@@ -21,12 +21,12 @@ def mujoco_twin(chain):
     for name, joints in bodies.items():
         last = model.getJointId(joints[-1])
         first = model.getJointId(joints[0])
-        place = model.jointPlacements[first]
-        quaternion = pin.Quaternion(place.rotation)
-        q = f"{quaternion.w!r} {quaternion.x!r} {quaternion.y!r} {quaternion.z!r}"
+        placement = model.jointPlacements[first]
+        quaternion = pin.Quaternion(placement.rotation)
+        quaternion_text = f"{quaternion.w!r} {quaternion.x!r} {quaternion.y!r} {quaternion.z!r}"
         inertia = model.inertias[last]
         i = inertia.inertia
-        text += f'<body name="{name}" pos="{_t(place.translation)}" quat="{q}">'
+        text += f'<body name="{name}" pos="{_t(placement.translation)}" quat="{quaternion_text}">'
         text += (
             f'<inertial pos="{_t(inertia.lever)}" mass="{inertia.mass!r}" '
             f'fullinertia="{_t([i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]])}"/>'
@@ -51,8 +51,7 @@ def _t(values):
 
 
 def mujoco_state(state, data):
-    """Set a state of the chain in MuJoCo's data; return the matrix that converts its forces
-    (n,)."""
+    """Set a state of the chain in MuJoCo's data; return a function that converts forces (n,)."""
     root = Rotation.from_quat(state.q[3:7]).as_matrix()
     data.qpos[:] = np.r_[state.q[:3], state.q[6], state.q[3:6], state.q[7:]]
     data.qvel[:] = np.r_[root @ state.v[:3], state.v[3:]]
@@ -76,8 +75,8 @@ def test_rnea_agrees_with_mujoco_over_200_random_states():
     assert worst < 1e-9
 
 
-def test_locked_patella_rides_on_the_femur():
-    """A chain without a patella equals one whose patella moves rigidly with the femur."""
+def test_a_locked_patella_moves_with_the_femur():
+    """A patella at rest on the femur gives the forces of a chain without patella."""
     free, locked = leg(True), leg(False)
     rng = np.random.default_rng(3)
     motion = random_motion(locked, rng)
@@ -94,7 +93,7 @@ def all_unknowns(state, rng):
     """Return a full set of 15 unknowns with arbitrary but separated lines of action."""
     point = state.point("femur", np.zeros(3))
 
-    def touch(z):
+    def condyle_point(z):
         normal = np.array([0.1, 1.0, 0.05 * np.sign(z)]) + 0.05 * rng.normal(size=3)
         return unknowns.CondylePoint(
             np.array([-0.005, 0.009, z]), normal / np.linalg.norm(normal), rng.normal(size=3), 0.0
@@ -105,13 +104,13 @@ def all_unknowns(state, rng):
     ligament = _line(state, ("patella", [0.0, -0.02, 0.0]), ("tibia", [0.05, 0.34, 0.0]))
     contact = state.point("patella", np.array([-0.012, -0.003, 0.0]))
     normal = rotate(femur, np.array([0.99, 0.14, 0.0]) / np.hypot(0.99, 0.14))
-    found = unknowns.hip(state.point("hip", np.zeros(3)))
-    found += [Unknown("quadriceps", quadriceps), Unknown("patellar_ligament", ligament)]
-    found += unknowns.patellofemoral(contact, normal, femur[:3, 2])
-    found += [unknowns.condyle("medial", touch(-0.023), 0.05)]
-    found += [unknowns.condyle("lateral", touch(0.022), 0.05)]
-    found += unknowns.residuals(point, lifted=False, extensor=True)
-    return found
+    unknown_loads = unknowns.hip(state.point("hip", np.zeros(3)))
+    unknown_loads += [Unknown("quadriceps", quadriceps), Unknown("patellar_ligament", ligament)]
+    unknown_loads += unknowns.patellofemoral(contact, normal, femur[:3, 2])
+    unknown_loads += [unknowns.condyle("medial", condyle_point(-0.023), 0.05)]
+    unknown_loads += [unknowns.condyle("lateral", condyle_point(0.022), 0.05)]
+    unknown_loads += unknowns.residuals(point, lifted=False, extensor=True)
+    return unknown_loads
 
 
 def _line(state, start, end):
@@ -124,26 +123,26 @@ def _line(state, start, end):
     )
 
 
-def test_all_wrenches_close_the_whole_body_balance():
-    """Hip, ground and gravity together give the rate of momentum of the leg."""
+def test_all_loads_together_give_the_rate_of_momentum_of_the_leg():
+    """Internal loads cancel: hip and ground, with gravity, change the momentum."""
     chain = leg()
     rng = np.random.default_rng(11)
-    closed = 0
+    regular_states = 0
     for _ in range(20):
         motion = random_motion(chain, rng)
         state = chain.at(motion)
         ground = state.ground_reaction(
             rng.normal(size=3) * 400, rng.normal(size=3), rng.normal(size=3) * 5
         )
-        found = all_unknowns(state, rng)
-        columns = state.generalised([unknown.loads for unknown in found])
+        unknown_loads = all_unknowns(state, rng)
+        columns = state.generalised([unknown.loads for unknown in unknown_loads])
         right = state.inertial - state.generalised([[ground]])[:, 0]
-        solution = solve([unknown.name for unknown in found], columns, right)
+        solution = solve([unknown.name for unknown in unknown_loads], columns, right)
         if not solution.regular:  # a random line may pass through the joint's axis
             continue
-        closed += 1
+        regular_states += 1
         loads = [ground]
-        for unknown in found:
+        for unknown in unknown_loads:
             x = solution.values[unknown.name]
             loads += [
                 PointForces(part.link, part.points, part.forces * x, part.moment * x)
@@ -151,9 +150,9 @@ def test_all_wrenches_close_the_whole_body_balance():
             ]
         origin = np.zeros(3)
         applied = total_wrench(loads, origin)
-        wanted = _momentum_rate(chain, state, origin)
-        assert np.linalg.norm(applied - wanted) < 1e-8 * np.linalg.norm(wanted)
-    assert closed >= 15
+        expected = _momentum_rate(chain, state, origin)
+        assert np.linalg.norm(applied - expected) < 1e-8 * np.linalg.norm(expected)
+    assert regular_states >= 15
 
 
 def _momentum_rate(chain, state, origin_in_insert):
@@ -167,7 +166,7 @@ def _momentum_rate(chain, state, origin_in_insert):
     return np.r_[force @ turn, data.dhg.angular @ turn + np.cross(centre, force @ turn)]
 
 
-def test_every_unknown_equals_its_finite_difference_virtual_work():
+def test_every_column_is_the_virtual_work_of_its_load():
     chain = leg()
     rng = np.random.default_rng(5)
     motion = random_motion(chain, rng)
@@ -186,11 +185,11 @@ def test_internal_loads_do_not_act_on_the_free_root():
     rng = np.random.default_rng(6)
     state = chain.at(random_motion(chain, rng))
     for unknown in all_unknowns(state, rng):
-        whole = state.generalised([unknown.loads])[:6, 0]
+        root_force = state.generalised([unknown.loads])[:6, 0]
         if unknown.name.startswith("hip"):
-            assert np.abs(whole).max() > 0.1
+            assert np.abs(root_force).max() > 0.1
         else:
-            np.testing.assert_allclose(whole, 0.0, atol=1e-12, err_msg=unknown.name)
+            np.testing.assert_allclose(root_force, 0.0, atol=1e-12, err_msg=unknown.name)
 
 
 def _virtual_work(chain, state, load, index, step=1e-6):
@@ -219,10 +218,10 @@ def test_a_missing_link_is_named():
         leg().frame_id("fibula")
 
 
-def test_insert_frame_is_the_origin_of_knee_ap():
+def test_the_insert_frame_is_the_origin_of_knee_ap():
     chain = leg()
-    wanted = Rotation.from_euler("xyz", [0, 0.02, 0.05]).as_matrix()
-    np.testing.assert_allclose(chain.insert_in_tibia[:3, :3], wanted, atol=1e-12)
+    expected = Rotation.from_euler("xyz", [0, 0.02, 0.05]).as_matrix()
+    np.testing.assert_allclose(chain.insert_in_tibia[:3, :3], expected, atol=1e-12)
     np.testing.assert_allclose(chain.insert_in_tibia[:3, 3], [-0.005, 0.39, 0.002], atol=1e-12)
 
 
@@ -231,6 +230,6 @@ def test_the_patella_joint_is_the_pose_at_zero_coordinates():
     motion = random_motion(chain, np.random.default_rng(3))
     motion.joints[0, 6:] = 0.0
     state = chain.at(motion)
-    stands = inverse(state.pose("femur")) @ state.pose("patella")
-    np.testing.assert_allclose(chain.patella_joint_in_femur, stands, atol=1e-12)
-    assert stands[2, 3] == pytest.approx(1e-3)
+    patella_in_femur = inverse(state.pose("femur")) @ state.pose("patella")
+    np.testing.assert_allclose(chain.patella_joint_in_femur, patella_in_femur, atol=1e-12)
+    assert patella_in_femur[2, 3] == pytest.approx(1e-3)

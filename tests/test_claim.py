@@ -43,7 +43,7 @@ def holder(tmp_path):
     process.communicate()
 
 
-def test_one_process_at_a_time(tmp_path, holder):
+def test_only_one_process_writes_at_a_time(tmp_path, holder):
     with (
         pytest.raises(InputError, match="another tkamb is writing"),
         claimed_directory(tmp_path / "out"),
@@ -98,23 +98,23 @@ def test_folders_of_earlier_releases_are_recognised(tmp_path, name, text, ours):
         pass
 
 
-@pytest.mark.parametrize("there", [False, True])
-def test_bad_input_leaves_no_new_file_or_folder(tmp_path, there):
+@pytest.mark.parametrize("exists", [False, True])
+def test_bad_input_leaves_no_new_file_or_folder(tmp_path, exists):
     out = tmp_path / "a" / "out"
-    if there:
+    if exists:
         out.mkdir(parents=True)
     with pytest.raises(InputError), claimed_directory(out):
         raise InputError("bad")
-    assert names(tmp_path) == ({"a"} if there else set())
-    assert not there or not names(out)
+    assert names(tmp_path) == ({"a"} if exists else set())
+    assert not exists or not names(out)
 
 
 def test_only_the_folders_own_temporary_files_are_removed(tmp_path):
     with claimed_directory(tmp_path) as folder:
         token = folder_token(folder)
-    own = tmp_path / f".tkamb-{token}-12ab.part"
+    temporary = tmp_path / f".tkamb-{token}-12ab.part"
     others = [".results.csv.12.part", ".tkamb-0123456789abcdef-12ab.part", ".backup.part"]
-    for name in (own.name, *others):
+    for name in (temporary.name, *others):
         (tmp_path / name).write_text("x")
     link = tmp_path / f".tkamb-{token}-link.part"
     link.symlink_to(tmp_path / ".backup.part")
@@ -169,7 +169,6 @@ def test_files_change_together(tmp_path):
 
 
 def test_interrupted_renames_are_completed_later(tmp_path, monkeypatch):
-    """A process is killed after some of its renames. The next process completes them."""
     for renames in range(1, 4):
         folder = tmp_path / str(renames)
         folder.mkdir()

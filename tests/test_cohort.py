@@ -224,7 +224,7 @@ def test_an_invalid_file_is_an_error_of_one_line(file, tmp_path, capsys, old, ne
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--workers", "0"], "0 is not within 1"),
+        (["--workers", "0"], "cannot be 0; give a number from 1"),
         (["--shard", "3/2"], "3/2 is not a part"),
         (["--shard", "1"], "'1' is not I/N"),
         (["--frames", "500:600"], "not in the motion"),

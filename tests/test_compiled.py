@@ -1,4 +1,4 @@
-"""Compiled loops: their cache, and the work without one."""
+"""Compiled loops: their cache, and compilation without one."""
 
 import ast
 import subprocess

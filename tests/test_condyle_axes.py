@@ -35,7 +35,7 @@ def femoral(kind):
     if kind in ("dm", "jw"):
         path = DATA / kind / "geometry" / "femoral_component.stl"
         if not path.exists():
-            pytest.skip("the real data are not here")
+            pytest.skip("the measured data are missing")
         return load_surface(path, "m", "-x,+y,-z", name=kind)
     if kind == "shipped":
         return load_surface(MODEL / "femoral_component.stl", "mm", "+x,+y,+z", name=kind)
@@ -64,10 +64,12 @@ def test_condyles_that_lie_askew_are_refused(kind, yaw):
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("yaw", [4, -9])
 def test_condyles_that_lie_side_by_side_are_split(kind, yaw):
-    whole = femoral(kind)
+    component = femoral(kind)
     # The notch of a real component lies behind the origin, so a yaw moves its middle sideways.
-    assert condyle_split(turned(whole, yaw)) == pytest.approx(condyle_split(whole), abs=6 * MM)
-    assert np.degrees(condyle_yaw(turned(whole, yaw))[0]) == pytest.approx(yaw, abs=3.0)
+    assert condyle_split(turned(component, yaw)) == pytest.approx(
+        condyle_split(component), abs=6 * MM
+    )
+    assert np.degrees(condyle_yaw(turned(component, yaw))[0]) == pytest.approx(yaw, abs=3.0)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -83,16 +85,16 @@ def one_condyle(kind):
     if kind == "sphere":
         return ball
     if kind == "cylinder":
-        made = trimesh.creation.cylinder(20 * MM, 50 * MM)
-        return Surface(np.asarray(made.vertices), np.asarray(made.faces), kind)
+        mesh = trimesh.creation.cylinder(20 * MM, 50 * MM)
+        return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces), kind)
     if kind == "runner":  # longer along x than along z
         return Surface(ball.vertices * [1.8, 1.0, 0.5], ball.faces, kind)
     if kind == "cap":
         return Surface(np.minimum(ball.vertices * [1.4, 1, 0.4], [1, 4 * MM, 1]), ball.faces, kind)
-    whole = femoral("shipped")
+    component = femoral("shipped")
     sign = 1.0 if kind == "lateral half" else -1.0
-    remaining = (sign * whole.triangles[:, :, 2] > 0).all(axis=1)
-    return Surface(whole.vertices, whole.faces[remaining], kind)
+    remaining = (sign * component.triangles[:, :, 2] > 0).all(axis=1)
+    return Surface(component.vertices, component.faces[remaining], kind)
 
 
 @pytest.mark.parametrize("yaw", [0, 20, 45, 75, 90, -30, -60])
@@ -106,9 +108,9 @@ def test_a_single_condyle_is_not_split_at_any_yaw(kind, yaw):
 @pytest.mark.parametrize("subject", ["dm", "jw"])
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_half_of_a_real_component_is_not_split_at_any_yaw(subject, sign):
-    whole = femoral(subject)
-    remaining = (sign * whole.triangles[:, :, 2] > 0).all(axis=1)
-    half = Surface(whole.vertices, whole.faces[remaining], "half")
+    component = femoral(subject)
+    remaining = (sign * component.triangles[:, :, 2] > 0).all(axis=1)
+    half = Surface(component.vertices, component.faces[remaining], "half")
     for yaw in (-75, -30, 0, 75):
         assert condyle_split(turned(half, yaw)) is None
 
@@ -176,10 +178,10 @@ def test_the_shape_shows_the_flexion(kind):
     for flexion in (-30.0, 0.0, 90.0, 150.0):
         for turn in (0.0, 20.0, 170.0):
             turned = Rotation.from_euler("YXZ", [turn, 8.0, flexion], degrees=True).as_matrix()
-            stands = orientation(body, pose(turned, np.zeros(3)))
-            assert np.degrees(stands.flexion) == pytest.approx(flexion, abs=10.0)
-            assert np.degrees(stands.tilt) == pytest.approx(8.0, abs=0.1)
-            assert stands.forward == pytest.approx(np.cos(np.radians(turn)), abs=0.1)
+            result = orientation(body, pose(turned, np.zeros(3)))
+            assert np.degrees(result.flexion) == pytest.approx(flexion, abs=10.0)
+            assert np.degrees(result.tilt) == pytest.approx(8.0, abs=0.1)
+            assert result.forward == pytest.approx(np.cos(np.radians(turn)), abs=0.1)
 
 
 SPHERES_APART = joined(*(sphere(0.005, 3, (0.0, 0.0, z)) for z in (-0.03, 0.03)))

@@ -35,10 +35,10 @@ def spiked(surface, height, where):
 
 def is_out_of_range(result):
     """Return whether a result is OUT_OF_RANGE, without numbers and with a reason."""
-    unknown = [result.approach, *result.pressure, *result.wrench_on_insert]
+    numbers = [result.approach, *result.pressure, *result.wrench_on_insert]
     return (
         result.status is ContactStatus.OUT_OF_RANGE
-        and np.isnan(unknown).all()
+        and np.isnan(numbers).all()
         and result.medial is None
         and bool(result.flags)
     )
@@ -62,7 +62,7 @@ def test_a_dish_without_a_bottom_is_out_of_range(name):
 @pytest.mark.parametrize("name", FEW)
 @pytest.mark.parametrize("body", ["femoral", "insert"])
 def test_a_spike_longer_than_the_insert_is_thick_is_out_of_range(name, body):
-    """The spike has 28 mm, on either mesh."""
+    """The spike is 28 mm long, on either mesh."""
     femoral, insert = FEMORAL, dished_insert(cells=24)
     if body == "femoral":
         femoral = spiked(femoral, -28e-3, [0, -20e-3, 10e-3])
@@ -88,7 +88,7 @@ def test_a_shorter_spike_is_flagged(length, pose, words):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_a_valid_press_has_no_such_flags(name):
+def test_a_valid_press_has_no_flag_of_a_spike_or_a_high_peak(name):
     result, _ = pressed(name, FEMORAL, dished_insert(cells=24), 1000.0, size=3.0)
     assert result.status is ContactStatus.OK
     assert not any(word in " ".join(result.flags) for word in ("spike", "thick:", "100 MPa"))
@@ -116,6 +116,6 @@ def test_a_peak_above_100_megapascal_is_flagged(name, insert):
 
 def test_thickness_near_a_rim_is_the_largest_one_nearby():
     dish = dished_insert(height=4e-3, cells=24)
-    whole = ContactPair(FEMORAL, dish, POLYETHYLENE)
+    bodies = ContactPair(FEMORAL, dish, POLYETHYLENE)
     places = np.array([[0, 2e-3, 10e-3], [12e-3, 4e-3, 20e-3]])
-    assert thickness_near(whole, places) == pytest.approx([2e-3, 4e-3], rel=0.05)
+    assert thickness_near(bodies, places) == pytest.approx([2e-3, 4e-3], rel=0.05)

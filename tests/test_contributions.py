@@ -1,4 +1,4 @@
-"""Contributions of muscles to the condyles: their sum, and terms against statics of the shank."""
+"""Contributions of the loads to the condyles' forces: their sum, and statics of the shank."""
 
 from dataclasses import replace
 
@@ -19,24 +19,32 @@ from tkamb.knee.unknowns import AXES
 from tkamb.run.muscles.shared_muscles import SharedMuscles
 
 FRICTION = 0.05
-PLACES = {"taut": [-0.06, -0.45, 0.0], "slack": [0.06, -0.45, 0.0], "one side": [-0.05, -0.45, 0.3]}
+GROUND_POINTS = {
+    "taut": [-0.06, -0.45, 0.0],
+    "slack": [0.06, -0.45, 0.0],
+    "one side": [-0.05, -0.45, 0.3],
+}
 
 
-def solved(where, least=0.05):
+def solved(where, least_activation=0.05):
     """Return geometry and loads of the bent knee with 700 N of ground reaction and ligaments."""
-    ground = PointForces("tibia", np.array([PLACES[where]]), 700 * UP[None])
+    ground = PointForces("tibia", np.array([GROUND_POINTS[where]]), 700 * UP[None])
     strap = np.array([0.0, 0.01, 0.04]), 90 * UP
     pull = (
         PointForces("tibia", strap[0][None], strap[1][None]),
         PointForces("femur", strap[0][None], -strap[1][None]),
     )
     knee = replace(bent_knee(), ground=ground, ligaments=pull)
-    return SharedMuscles(two_flexors(1, reserve=2.0, least=least)).frame(0).solve(knee, FRICTION)
+    return (
+        SharedMuscles(two_flexors(1, reserve=2.0, least=least_activation))
+        .frame(0)
+        .solve(knee, FRICTION)
+    )
 
 
-@pytest.mark.parametrize("where", PLACES)
+@pytest.mark.parametrize("where", GROUND_POINTS)
 def test_contributions_add_up_to_the_normal_forces(where):
-    geometry, loads = solved(where, least=0.0 if where == "slack" else 0.05)
+    geometry, loads = solved(where, least_activation=0.0 if where == "slack" else 0.05)
     assert loads.slack == (where == "slack")
     assert bool(loads.lifted) == (where == "one side")
     parts = condyle_contributions(geometry, loads, FRICTION)
@@ -54,8 +62,8 @@ def shank_alone(geometry, wrench):
     columns = [wrench_of(c.point, -c.direction(FRICTION)) for c in contacts.values()]
     columns += [wrench_of(middle, AXES[axis]) for axis in ("ap", "ml")]
     columns += [np.concatenate([np.zeros(3), AXES[axis]]) for axis in ("si", "ml")]
-    found = np.linalg.solve(np.array(columns).T, -wrench)
-    return dict(zip(contacts, found[:2], strict=True))
+    magnitudes = np.linalg.solve(np.array(columns).T, -wrench)
+    return dict(zip(contacts, magnitudes[:2], strict=True))
 
 
 def test_a_flexor_contribution_agrees_with_statics_of_the_shank():
@@ -70,16 +78,16 @@ def test_a_flexor_contribution_agrees_with_statics_of_the_shank():
 
 def on_link(loads, link):
     """Return the wrench (6,) of loads on one link."""
-    own = [load for load in loads if load.link == link]
-    return sum(wrench_of(load.points, load.forces).sum(axis=0) for load in own)
+    on_this_link = [load for load in loads if load.link == link]
+    return sum(wrench_of(load.points, load.forces).sum(axis=0) for load in on_this_link)
 
 
 def test_a_cam_on_the_post_is_a_separate_contribution():
     """With a post the terms add up, and the post's term agrees with statics of the shank."""
-    place, push = np.array([-0.003, 0.02, 0.004]), np.array([400.0, -60.0, 20.0])
+    point, cam_force = np.array([-0.003, 0.02, 0.004]), np.array([400.0, -60.0, 20.0])
     post = (
-        PointForces("tibia", place[None], push[None]),
-        PointForces("femur", place[None], -push[None]),
+        PointForces("tibia", point[None], cam_force[None]),
+        PointForces("femur", point[None], -cam_force[None]),
     )
     geometry, _ = solved("taut")
     geometry, loads = (
@@ -88,13 +96,13 @@ def test_a_cam_on_the_post_is_a_separate_contribution():
         .solve(replace(geometry, post=post), FRICTION)
     )
     parts = condyle_contributions(geometry, loads, FRICTION)
-    for side, force in shank_alone(geometry, wrench_of(place, push)).items():
+    for side, force in shank_alone(geometry, wrench_of(point, cam_force)).items():
         assert parts[side][POST] == pytest.approx(force, rel=1e-9)
         assert sum(parts[side].values()) == pytest.approx(loads.values[f"{side}_normal"], abs=1e-6)
 
 
 def test_the_quadriceps_presses_by_the_patellar_ligament_alone():
-    """The patella's equilibrium gives the ligament, the shank's gives the normal forces."""
+    """Equilibrium of the patella gives the ligament; that of the shank gives the normal forces."""
     geometry, loads = solved("taut")
     parts = condyle_contributions(geometry, loads, FRICTION)
     extensor, femur = geometry.extensor, geometry.state.pose("femur")

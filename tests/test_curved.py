@@ -80,13 +80,13 @@ def test_a_flat_that_meets_a_fillet_stays_flat():
     points, weights = scattered(surface, faces)
     shift, _ = CurvedSurface.of(surface).shift(faces, weights, UP)
     inner = np.abs(points[:, 2]) < 1e-3
-    flat, round_ = (
+    flat, fillet = (
         inner & (points[:, 0] < 0),
         inner & (points[:, 0] > 0.5e-3) & (points[:, 0] < 1.5e-3),
     )
     exact = height(points[:, 0], 0.0) - points[:, 1]
     assert np.abs(shift[flat]).max() < 1e-6
-    assert np.abs(shift - exact)[round_].max() < 0.35 * exact[round_].max()
+    assert np.abs(shift - exact)[fillet].max() < 0.35 * exact[fillet].max()
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.7])

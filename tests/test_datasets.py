@@ -45,7 +45,7 @@ def dataset(monkeypatch):
 
 
 class Server(http.server.ThreadingHTTPServer):
-    """Serves CONTENT under a commit; `answers` maps a path to another answer."""
+    """Serves `files` (path -> content), notes paths as `asked`, and truncates files in `cut`."""
 
     def __init__(self):
         super().__init__(("127.0.0.1", 0), Handler)
@@ -96,20 +96,20 @@ def get(capsys, *arguments, status=0):
     return out
 
 
-def whole(folder):
+def is_complete(folder):
     return all((folder / name).read_bytes() == CONTENT[name] for name in files_in(folder))
 
 
-def test_downloads_once_and_then_keeps(tmp_path, dataset, server, capsys):
+def test_files_are_downloaded_once(tmp_path, dataset, server, capsys):
     assert "3 files written, 0 were there" in get(capsys, "--to", tmp_path, "--url", server.url)
     assert files_in(tmp_path) == set(CONTENT)
-    assert whole(tmp_path)
+    assert is_complete(tmp_path)
     asked = list(server.asked)
     assert "0 files written, 3 were there" in get(capsys, "--to", tmp_path, "--url", server.url)
     assert server.asked == asked
 
 
-def test_an_interrupted_download_goes_on(tmp_path, dataset, server, capsys):
+def test_an_interrupted_download_is_resumed(tmp_path, dataset, server, capsys):
     server.cut.add("/c0ffee/Geometry/Part decimated.stl")
     get(capsys, "--to", tmp_path, "--url", server.url, status=2)
     assert files_in(tmp_path) == {"model.osim"}
@@ -117,58 +117,58 @@ def test_an_interrupted_download_goes_on(tmp_path, dataset, server, capsys):
     server.asked.clear()
     get(capsys, "--to", tmp_path, "--url", server.url)
     assert files_in(tmp_path) == set(CONTENT)
-    assert whole(tmp_path)
+    assert is_complete(tmp_path)
     assert "/c0ffee/models/A model.osim" not in server.asked
 
 
 def test_another_content_is_not_kept(tmp_path, dataset, server, capsys):
     server.files["/c0ffee/models/A model.osim"] += b" "
-    said = get(capsys, "--to", tmp_path / "new", "--url", server.url, status=2)
-    assert "SHA-256" in said
-    assert "model.osim" in said
+    output = get(capsys, "--to", tmp_path / "new", "--url", server.url, status=2)
+    assert "SHA-256" in output
+    assert "model.osim" in output
     assert not (tmp_path / "new").exists()
 
 
-def test_a_file_that_is_gone(tmp_path, dataset, server, capsys):
+def test_a_file_that_the_server_lacks_is_an_error(tmp_path, dataset, server, capsys):
     del server.files["/c0ffee/models/A model.osim"]
-    said = get(capsys, "--to", tmp_path / "new", "--url", server.url, status=2)
-    assert "HTTP status 404" in said
+    output = get(capsys, "--to", tmp_path / "new", "--url", server.url, status=2)
+    assert "HTTP status 404" in output
     assert not (tmp_path / "new").exists()
 
 
-def test_no_network(tmp_path, dataset, capsys):
-    with socket.socket() as closed:  # bound, but nobody listens
+def test_no_network_is_an_error_with_a_remedy(tmp_path, dataset, capsys):
+    with socket.socket() as closed:  # This port is bound, but no server listens.
         closed.bind(("127.0.0.1", 0))
         url = f"http://127.0.0.1:{closed.getsockname()[1]}"
-        said = get(capsys, "--to", tmp_path / "new", "--url", url, status=2)
-    assert "no network?" in said
-    assert "--from DIR" in said
+        output = get(capsys, "--to", tmp_path / "new", "--url", url, status=2)
+    assert "no network?" in output
+    assert "--from DIR" in output
     assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize("url", ["ftp.example", "http://", "file:///etc"])
-def test_a_mirror_that_is_none(url, tmp_path, dataset, capsys):
+def test_an_impossible_mirror_address_is_refused(url, tmp_path, dataset, capsys):
     get(capsys, "--to", tmp_path / "new", "--url", url, status=2)
     assert not (tmp_path / "new").exists()
 
 
 def test_without_pooch_one_line_says_how_to_get_it(tmp_path, dataset, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "pooch", None)
-    said = get(capsys, "--to", tmp_path / "new", status=2)
-    assert "pip install 'tkamb[data]'" in said
+    output = get(capsys, "--to", tmp_path / "new", status=2)
+    assert "pip install 'tkamb[data]'" in output
     assert not (tmp_path / "new").exists()
 
 
 def test_a_file_of_unknown_address_is_named_and_not_asked_for(tmp_path, dataset, server, capsys):
     dataset(file_of("model.osim"), file_of("motion/walk.sto", commit=None, path=None))
-    said = get(capsys, "--to", tmp_path, "--url", server.url)
-    assert "motion/walk.sto" in said
+    output = get(capsys, "--to", tmp_path, "--url", server.url)
+    assert "motion/walk.sto" in output
     assert files_in(tmp_path) == {"model.osim"}
 
 
 @pytest.mark.parametrize("names", [CONTENT.keys(), PUBLISHED.values(), ["flat"]])
-def test_a_folder_of_downloads(names, tmp_path, dataset, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pooch", None)  # not needed
+def test_files_are_copied_from_a_folder_of_downloads(names, tmp_path, dataset, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pooch", None)  # A copy does not need pooch.
     source, to = tmp_path / "by hand", tmp_path / "new"
     flat = [Path(path).name for path in PUBLISHED.values()]
     for name, content in zip(flat if names == ["flat"] else names, CONTENT.values(), strict=True):
@@ -176,7 +176,7 @@ def test_a_folder_of_downloads(names, tmp_path, dataset, capsys, monkeypatch):
         (source / name).write_bytes(content)
     assert "3 files written" in get(capsys, "--from", source, "--to", to)
     assert files_in(to) == set(CONTENT)
-    assert whole(to)
+    assert is_complete(to)
 
 
 def test_a_damaged_download_leaves_nothing(tmp_path, dataset, capsys):
@@ -184,12 +184,12 @@ def test_a_damaged_download_leaves_nothing(tmp_path, dataset, capsys):
         (tmp_path / "by hand" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "by hand" / name).write_bytes(content)
     (tmp_path / "by hand" / "motion" / "walk.sto").write_bytes(b"1 2 3\n")
-    said = get(capsys, "--from", tmp_path / "by hand", "--to", tmp_path / "new", status=2)
-    assert "walk.sto" in said
+    output = get(capsys, "--from", tmp_path / "by hand", "--to", tmp_path / "new", status=2)
+    assert "walk.sto" in output
     assert not (tmp_path / "new").exists()
 
 
-def test_folders_that_hold_nothing(tmp_path, dataset, capsys):
+def test_an_empty_or_absent_folder_is_refused(tmp_path, dataset, capsys):
     assert "none of the files" in get(capsys, "--from", tmp_path, "--to", tmp_path / "n", status=2)
     assert "not a folder" in get(capsys, "--from", tmp_path / "0", "--to", tmp_path / "n", status=2)
     assert files_in(tmp_path) == set()
@@ -197,18 +197,18 @@ def test_folders_that_hold_nothing(tmp_path, dataset, capsys):
 
 def test_a_changed_file_is_not_replaced(tmp_path, dataset, server, capsys):
     (tmp_path / "model.osim").write_bytes(b"mine")
-    said = get(capsys, "--to", tmp_path, "--url", server.url, status=2)
-    assert "does not replace your files" in said
+    output = get(capsys, "--to", tmp_path, "--url", server.url, status=2)
+    assert "does not replace your files" in output
     assert (tmp_path / "model.osim").read_bytes() == b"mine"
     assert server.asked == []
 
 
-def test_a_target_that_is_a_file(tmp_path, dataset, server, capsys):
+def test_a_target_that_is_a_file_is_refused(tmp_path, dataset, server, capsys):
     (tmp_path / "taken").write_bytes(b"")
     get(capsys, "--to", tmp_path / "taken", "--url", server.url, status=2)
 
 
-def test_the_registry_names_what_the_scenes_use():
+def test_the_registry_has_all_files_of_the_scenes():
     files = {file.name: file for file in read_dataset("dm").files}
     scenes = Path(__file__).parents[1] / "models" / "dm"
     text = "".join(path.read_text() for path in scenes.glob("*.toml"))
@@ -219,9 +219,9 @@ def test_the_registry_names_what_the_scenes_use():
     assert all(len(file.sha256) == 64 for file in files.values())
 
 
-@pytest.mark.skipif(not SHARED.is_dir(), reason="the real data are not here")
+@pytest.mark.skipif(not SHARED.is_dir(), reason="subject DM's files (../shared/data/dm) are absent")
 def test_the_real_files_are_the_registered_ones(tmp_path, capsys):
-    said = get(capsys, "--from", SHARED, "--to", tmp_path / "dm")
+    output = get(capsys, "--from", SHARED, "--to", tmp_path / "dm")
     names = json.loads((Path(inspect.getfile(Dataset)).parent / "dm.json").read_text())["files"]
-    assert f"{len(names)} files written" in said
+    assert f"{len(names)} files written" in output
     assert files_in(tmp_path / "dm") == set(names)

@@ -1,5 +1,4 @@
-"""The shipped deep knee bend: sound meshes that touch, a consistent chain, and a script
-that makes every byte of it."""
+"""The shipped deep knee bend: meshes, motion, chain, and the script that makes its files."""
 
 import re
 import sys
@@ -47,7 +46,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def poses(motion):
-    """pose_femoral_in_insert of every frame, m."""
+    """Return pose_femoral_in_insert of every frame, m."""
     lengths = [motion[name] * 1e-3 for name in ("ap_mm", "si_mm", "ml_mm")]
     names = ("axial_rotation_deg", "adduction_deg", "flexion_deg")
     angles = [np.radians(motion[name]) for name in names]
@@ -56,10 +55,10 @@ def poses(motion):
 
 @pytest.fixture(scope="module")
 def patella(motion):
-    """pose_patella_in_femur of every frame, m."""
+    """Return pose_patella_in_femur of every frame, m."""
     c, s = (f(np.radians(motion["patella_rotation_deg"])) for f in (np.cos, np.sin))
-    o, one = np.zeros_like(c), np.ones_like(c)
-    rotation = np.stack([c, -s, o, s, c, o, o, o, one], axis=1).reshape(-1, 3, 3)
+    o, ones = np.zeros_like(c), np.ones_like(c)
+    rotation = np.stack([c, -s, o, s, c, o, o, o, ones], axis=1).reshape(-1, 3, 3)
     place = np.stack([motion["patella_ap_mm"], motion["patella_si_mm"], o], axis=1)
     return pose(rotation, place * 1e-3)
 
@@ -119,9 +118,9 @@ def test_facets_are_within_five_micrometres_where_the_condyles_meet():
         arm = middles[:, :2] - centre
         phi, reach = np.arctan2(-arm[:, 0], -arm[:, 1]), np.linalg.norm(arm, axis=1)
         low, high = max(start, np.radians(-12.0)), min(end, np.radians(134.0))
-        here = (phi > low) & (phi < high) & (np.abs(reach - radius) < 3.5)
-        exact = radius - FEMORAL.depth(phi[here], middles[here, 2])
-        error.append(exact - reach[here])
+        in_arc = (phi > low) & (phi < high) & (np.abs(reach - radius) < 3.5)
+        exact = radius - FEMORAL.depth(phi[in_arc], middles[in_arc, 2])
+        error.append(exact - reach[in_arc])
     error = np.concatenate(error)
     assert len(error) > 5000
     assert np.abs(error).max() < 5e-3
@@ -135,8 +134,8 @@ def test_facets_are_within_five_micrometres_where_the_condyles_meet():
 def test_both_condyles_touch_in_every_frame(poses):
     query = ClosestPointQuery(surface("femoral_component"), surface("insert"), 0.0)
     gaps = [query.at(p) for p in poses]
-    both = np.array([[g.medial.gap, g.lateral.gap] for g in gaps])
-    assert np.abs(both).max() < 2e-5
+    condyle_gaps = np.array([[g.medial.gap, g.lateral.gap] for g in gaps])
+    assert np.abs(condyle_gaps).max() < 2e-5
 
 
 def test_motion_is_a_bend_from_rest_to_rest(motion):
@@ -193,7 +192,7 @@ def test_knee_coordinates_of_the_chain_are_those_of_the_package(motion, poses):
     )
 
 
-def test_no_ligament_is_overstrained_and_the_pcl_waits_for_flexion(
+def test_no_ligament_is_overstrained_and_the_pcl_is_slack_before_45_deg(
     scene, motion, poses, insert_in_tibia
 ):
     strain = {}
@@ -253,8 +252,8 @@ def test_package_finds_the_patella_where_the_script_put_it(motion):
 
     case = load_case(load_scene(MODEL / "scene.toml", {"patella.motion": "solved"}))
     frames = np.arange(0, 101, 5)
-    found = mechanics_of(case, near=True).extensor.states
-    for k, state in zip(frames, found[::5], strict=True):
+    states = mechanics_of(case, near=True).extensor.states
+    for k, state in zip(frames, states[::5], strict=True):
         ap, si, rotation = state.coordinates
         assert ap * 1e3 == pytest.approx(motion["patella_ap_mm"][k], abs=0.03)
         assert si * 1e3 == pytest.approx(motion["patella_si_mm"][k], abs=0.03)
@@ -265,16 +264,16 @@ def test_package_finds_the_patella_where_the_script_put_it(motion):
 def test_script_makes_what_is_shipped(tmp_path):
     model.make(tmp_path)
     assert comparison.differences(tmp_path, MODEL) == []
-    made = {path.name for path in tmp_path.iterdir()}
+    names = {path.name for path in tmp_path.iterdir()}
     named = re.findall(r'"([\w.]+\.(?:stl|csv|urdf))"', (MODEL / "scene.toml").read_text())
-    assert set(named) <= made
+    assert set(named) <= names
 
 
 def test_comparison_notices_a_difference(tmp_path):
-    shipped, made = tmp_path / "shipped", tmp_path / "made"
-    for folder, value in ((shipped, "1.0000000"), (made, "1.0000100")):
+    shipped, copy = tmp_path / "shipped", tmp_path / "made"
+    for folder, value in ((shipped, "1.0000000"), (copy, "1.0000100")):
         folder.mkdir()
         (folder / "motion.csv").write_text(f"time_s\n{value}\n")
-    assert comparison.differences(made, shipped) == ["motion.csv: differs"]
-    (made / "motion.csv").write_text("time_s\n1.0000001\n")
-    assert comparison.differences(made, shipped) == []
+    assert comparison.differences(copy, shipped) == ["motion.csv: differs"]
+    (copy / "motion.csv").write_text("time_s\n1.0000001\n")
+    assert comparison.differences(copy, shipped) == []

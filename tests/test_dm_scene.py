@@ -65,7 +65,7 @@ def test_frames_changed_by_the_filter_are_in_swing_or_at_the_seam():
     assert set(np.flatnonzero(rough)) <= {0, 99, 100, *range(62, 96)}
 
 
-def test_condylar_gaps_of_the_recorded_poses():
+def test_condylar_gaps_of_the_recorded_poses_agree_with_the_notes():
     query = ClosestPointQuery(case().femoral, case().insert, case().split)
     result = [query.at(pose) for pose in knee_pose(case().motion.raw_coordinates[::5])]
     for side, stated in (("medial", MEDIAL_MM), ("lateral", LATERAL_MM)):
@@ -151,12 +151,12 @@ def test_centre_of_pressure_lies_between_heel_and_toe_markers():
         heel, toe = feet["R"]
         assert heel[k, 0] - 0.02 < ground.point[k, 0] < toe[k, 0] + 0.02
         assert abs(ground.point[k, 2] - 0.5 * (heel[k, 2] + toe[k, 2])) < 0.05
-        left = 0.5 * (feet["L"][0][k] + feet["L"][1][k])
-        assert abs(ground.point[k, 2] - left[2]) > 0.1
+        left_foot = 0.5 * (feet["L"][0][k] + feet["L"][1][k])
+        assert abs(ground.point[k, 2] - left_foot[2]) > 0.1
 
 
 def test_stride_is_the_most_representative_one():
-    """Its distance to the mean of ground reaction and shank lean is the smallest of all strides."""
+    """Of all strides it is the nearest to the mean of ground reaction and shank lean."""
     scene = case().scene
     plate = read_table(scene.ground_reaction.file)
     vertical = plate.column("ground_force_2_vy")
@@ -240,4 +240,4 @@ def test_a_misplaced_shank_marker_is_asked_about():
     places = scene.tibia.markers_mm
     places["R_Shank_Inferior"] = tuple(np.array(places["R_Shank_Inferior"]) + 50.0)
     (question,) = marker_questions(load_case(scene))
-    assert question.text.startswith("the shank's markers lie ")
+    assert question.text.startswith("the markers of the shank lie ")

@@ -10,7 +10,7 @@ from tkamb.knee.equations import dome_sensitivity, solve_knee
 
 
 def test_quadriceps_follows_the_arms_about_the_shifted_contact(knee):  # noqa: F811
-    """Moments about the contact point without the patella's weight: Q a_Q = PL a_PL."""
+    """About the contact point, without the patella's weight, Q a_Q = PL a_PL."""
     geometry = loaded(knee, 700 * UP, [-0.06, -0.45, 0.0])
     loads, state, extensor = solve_knee(geometry, FRICTION), geometry.state, geometry.extensor
     ligament = loads.values["patellar_ligament"]
@@ -26,9 +26,9 @@ def test_quadriceps_follows_the_arms_about_the_shifted_contact(knee):  # noqa: F
     step = 0.5e-3
     point = extensor.contact_point
     slope = (quadriceps(point + step * up) - quadriceps(point - step * up)) / (2 * step)
-    found = dome_sensitivity(geometry, loads, FRICTION)
+    sensitivity = dome_sensitivity(geometry, loads, FRICTION)
     assert loads.values["muscle_quadriceps"] == pytest.approx(quadriceps(point), rel=0.01)
-    assert found[0] == pytest.approx(slope, rel=0.02)
+    assert sensitivity[0] == pytest.approx(slope, rel=0.02)
     assert abs(slope) > 0.005e3 * loads.values["muscle_quadriceps"]  # more than 0.5 % per mm
 
 
@@ -36,12 +36,12 @@ def test_the_sensitivity_is_the_slope_of_a_shifted_frame(knee):  # noqa: F811
     geometry, step = loaded(knee, 700 * UP, [-0.06, -0.45, 0.0]), 1e-5
     extensor, up = geometry.extensor, geometry.state.pose("patella")[:3, 1]
     ends = []
-    for way in (-1, 1):
-        moved = replace(extensor, contact_point=extensor.contact_point + way * step * up)
+    for sign in (-1, 1):
+        moved = replace(extensor, contact_point=extensor.contact_point + sign * step * up)
         values = solve_knee(replace(geometry, extensor=moved), FRICTION).values
         ends.append(np.array([values["muscle_quadriceps"], values["patellofemoral"]]))
-    found = dome_sensitivity(geometry, solve_knee(geometry, FRICTION), FRICTION)
-    assert found == pytest.approx((ends[1] - ends[0]) / (2 * step), rel=1e-5)
+    sensitivity = dome_sensitivity(geometry, solve_knee(geometry, FRICTION), FRICTION)
+    assert sensitivity == pytest.approx((ends[1] - ends[0]) / (2 * step), rel=1e-5)
 
 
 def test_a_slack_quadriceps_has_no_sensitivity(knee):  # noqa: F811

@@ -49,12 +49,12 @@ def test_lattice_and_finite_elements_agree_on_two_condyles(law):
 def test_lattice_and_finite_elements_converge_to_each_other():
     """The difference in approach falls with the cell size."""
     bodies = pair(condyles(subdivisions=6), dished_insert(cells=72), material("polyethylene"))
-    apart = []
+    differences = []
     for size in (2.5, 1.25):
         approaches = []
         for name in ("lattice", "fe"):
             model = contact_model(name, size)
             state = model.prepare(bodies)
             approaches.append(model.press(state, 1500.0, knee_pose(np.zeros(6))).approach)
-        apart.append(abs(approaches[0] / approaches[1] - 1))
-    assert apart[1] < 0.75 * apart[0]
+        differences.append(abs(approaches[0] / approaches[1] - 1))
+    assert differences[1] < 0.75 * differences[0]

@@ -58,9 +58,9 @@ def test_uneven_samples_give_the_same_curve():
     def signal(t):
         return np.sin(2 * np.pi * t) + 0.2 * np.cos(2 * np.pi * 2.3 * t)
 
-    one = differentiate_coordinates(even, signal(even), CUTOFF, at)
-    two = differentiate_coordinates(uneven, signal(uneven), CUTOFF, at)
-    for first, second, scale in zip(one, two, (1.0, 10.0, 100.0), strict=True):
+    from_even = differentiate_coordinates(even, signal(even), CUTOFF, at)
+    from_uneven = differentiate_coordinates(uneven, signal(uneven), CUTOFF, at)
+    for first, second, scale in zip(from_even, from_uneven, (1.0, 10.0, 100.0), strict=True):
         np.testing.assert_allclose(first, second, atol=1e-3 * scale)
 
 
@@ -161,11 +161,13 @@ def test_filtered_orientation_does_not_depend_on_the_axes():
     poses[:, :3, :3] = poses[:, :3, :3] @ noise
     left, right = (Rotation.random(random_state=k).as_matrix() for k in (4, 5))
     turned = pose(left @ poses[:, :3, :3] @ right, poses[:, :3, 3] @ left.T)
-    one, velocity, _ = differentiate_poses(t, poses, CUTOFF)
-    two, velocity_turned, _ = differentiate_poses(t, turned, CUTOFF)
-    np.testing.assert_allclose(left @ one[:, :3, :3] @ right, two[:, :3, :3], atol=1e-9)
+    filtered, velocity, _ = differentiate_poses(t, poses, CUTOFF)
+    filtered_turned, velocity_turned, _ = differentiate_poses(t, turned, CUTOFF)
+    np.testing.assert_allclose(
+        left @ filtered[:, :3, :3] @ right, filtered_turned[:, :3, :3], atol=1e-9
+    )
     np.testing.assert_allclose(velocity[:, 3:] @ right, velocity_turned[:, 3:], atol=1e-7)
-    error = Rotation.from_matrix(np.swapaxes(one[:, :3, :3], 1, 2) @ moving(t)[:, :3, :3])
+    error = Rotation.from_matrix(np.swapaxes(filtered[:, :3, :3], 1, 2) @ moving(t)[:, :3, :3])
     assert np.median(error.magnitude()) < 0.01
 
 
@@ -180,7 +182,7 @@ def test_filtered_orientation_does_not_depend_on_the_axes():
         (np.linspace(0, 2, 5), np.zeros(5), "none", "5 samples are too few"),
     ],
 )
-def test_unusable_samples(time, value, cutoff, message):
+def test_unusable_samples_are_refused(time, value, cutoff, message):
     with pytest.raises(InputError, match=message) as caught:
         differentiate_coordinates(time, value, cutoff, name="gait.csv")
     assert "gait.csv" in str(caught.value)
@@ -189,7 +191,7 @@ def test_unusable_samples(time, value, cutoff, message):
 def test_too_few_frames_for_the_cutoff_are_refused_with_the_number_needed():
     time = np.linspace(0.0, 2.0, 26)
     check_frames(time, 6.0, 26)
-    differentiate_coordinates(time, np.zeros(26), 6.0)  # the number that the message gives does
+    differentiate_coordinates(time, np.zeros(26), 6.0)  # the number in the message is accepted
     with pytest.raises(InputError, match=r"frames = 25 resamples to 12 Hz.*give 26 or more"):
         check_frames(np.linspace(0.0, 2.0, 25), 6.0, 25)
     check_frames(np.linspace(0.0, 2.0, 25), "none", 25)

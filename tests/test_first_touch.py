@@ -35,7 +35,7 @@ def bodies():
     return femoral, insert
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_first_touch_is_just_below_the_clearance_of_the_vertices(seed):
     """Edges may touch before vertices, by less than the sagitta of the facets."""
     rng = np.random.default_rng(seed)
@@ -67,8 +67,8 @@ def test_a_condyle_beside_the_insert_has_no_touch():
     medial, lateral = FirstTouch(femoral, flat_insert(10e-3), -30e-3).at(np.eye(4))
     assert medial is None
     assert lateral.travel == pytest.approx(-30e-3, abs=1e-6)
-    away = pose(np.eye(3), [1.0, 0, 0])
-    assert np.isnan(FirstTouch(femoral, flat_insert(10e-3)).travel(away))
+    beside = pose(np.eye(3), [1.0, 0, 0])
+    assert np.isnan(FirstTouch(femoral, flat_insert(10e-3)).travel(beside))
 
 
 def test_travel_depends_on_the_pose_and_not_on_the_femoral_frame():

@@ -15,7 +15,7 @@ from tkamb.geometry.surface import Surface
 from tkamb.io.recordings.meshes import axes_rotation, load_surface
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
-needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the real data are not here")
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the measured data are missing")
 
 AXES = ["+x,+y,+z", "-x,+y,-z", "+z,+x,+y", "+y,-z,-x", "-z,-x,+y", "+x,-z,+y"]
 
@@ -26,8 +26,8 @@ def tilted(surface, x_deg, z_deg, shift=(0.003, -0.02, 0.011)):
 
 
 def box(x, y, z, centre=(0.0, 0.0, 0.0)):
-    made = trimesh.creation.box((x, y, z))
-    return Surface(np.asarray(made.vertices) + centre, np.asarray(made.faces, np.int64), "box")
+    mesh = trimesh.creation.box((x, y, z))
+    return Surface(np.asarray(mesh.vertices) + centre, np.asarray(mesh.faces, np.int64), "box")
 
 
 def test_the_origin_of_the_insert_frame_is_the_middle_of_the_bottom():
@@ -97,15 +97,15 @@ def test_a_larger_side_wall_gives_a_notice(caplog):
 
 
 def test_two_possible_bottoms_are_refused_with_their_places():
-    two = joined(box(0.03, 0.01, 0.03), box(0.03, 0.01, 0.03, (0.031, 0.002, 0.0)))
+    bodies = joined(box(0.03, 0.01, 0.03), box(0.03, 0.01, 0.03, (0.031, 0.002, 0.0)))
     with pytest.raises(InputError, match="two flats that could be its bottom") as caught:
-        insert_placement(two)
+        insert_placement(bodies)
     assert str(caught.value).count("900 mm²") == 2
 
 
 def test_the_clearly_larger_of_two_levels_is_the_bottom():
-    two = joined(box(0.03, 0.01, 0.03), box(0.02, 0.008, 0.03, (0.026, 0.001, 0.0)))
-    assert find_flat_bottom(two).area == pytest.approx(9e-4)
+    bodies = joined(box(0.03, 0.01, 0.03), box(0.02, 0.008, 0.03, (0.026, 0.001, 0.0)))
+    assert find_flat_bottom(bodies).area == pytest.approx(9e-4)
 
 
 def test_a_sphere_has_no_flat_bottom():
@@ -116,7 +116,7 @@ def test_a_sphere_has_no_flat_bottom():
 
 @needs_data
 @pytest.mark.parametrize("subject", ["dm", "jw"])
-def test_real_inserts(subject):
+def test_the_frame_of_a_real_insert_does_not_depend_on_tilt_and_noise(subject):
     path = DATA / subject / "geometry" / "tibial_insert.stl"
     insert = load_surface(path, "m", "-x,+y,-z", name="insert", closed=True)
     placement = insert_placement(insert)
@@ -127,8 +127,8 @@ def test_real_inserts(subject):
     assert 2.0e-3 < flat.area < 2.4e-3
     for x_deg, z_deg in [(10, 0), (-10, 0), (0, 10), (0, -10)]:
         tilted_insert = tilted(insert, x_deg, z_deg)
-        again = transform(insert_placement(tilted_insert), tilted_insert.vertices)
-        assert np.allclose(again, placed.vertices, atol=1e-8)
+        levelled = transform(insert_placement(tilted_insert), tilted_insert.vertices)
+        assert np.allclose(levelled, placed.vertices, atol=1e-8)
     rng = np.random.default_rng(0)
     noisy = Surface(insert.vertices + rng.normal(0, 1e-5, insert.vertices.shape), insert.faces)
     assert np.allclose(insert_placement(noisy), placement, atol=2.5e-4)

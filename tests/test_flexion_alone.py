@@ -32,22 +32,24 @@ def scene_of(folder, columns, released):
     overrides = {"motion.file": str(file), "contact.released": released}
     overrides |= COARSE
     scene = load_scene(BEND / "scene.toml", overrides)
-    named = {k: v for k, v in scene.motion.columns.items() if v in columns}
-    return scene.model_copy(update={"motion": scene.motion.model_copy(update={"columns": named})})
+    column_names = {k: v for k, v in scene.motion.columns.items() if v in columns}
+    return scene.model_copy(
+        update={"motion": scene.motion.model_copy(update={"columns": column_names})}
+    )
 
 
 def test_flexion_alone_gives_the_equilibrium_of_the_whole_recording(tmp_path):
     alone = load_case(scene_of(tmp_path, list(ROLES.values()), ALL))
-    whole = load_case(load_scene(BEND / "scene.toml", {"contact.released": ALL} | COARSE))
+    full = load_case(load_scene(BEND / "scene.toml", {"contact.released": ALL} | COARSE))
     assert set(alone.motion.unrecorded) == {*ALL, "si"}
-    sides = [contact_side(case, mechanics_of(case)) for case in (alone, whole)]
+    sides = [contact_side(case, mechanics_of(case)) for case in (alone, full)]
     for k in (30, 75):
         contacts = [side.frame(k)[1] for side in sides]
         assert not any(contact.problem for contact in contacts)
         places = [contact.equilibrium.coordinates for contact in contacts]
-        apart = np.abs(places[0] - places[1])
-        assert apart[:3].max() < 2e-4, k
-        assert np.degrees(apart[3:]).max() < 0.3, k
+        difference = np.abs(places[0] - places[1])
+        assert difference[:3].max() < 2e-4, k
+        assert np.degrees(difference[3:]).max() < 0.3, k
 
 
 def test_the_initial_guess_touches_the_insert(tmp_path):

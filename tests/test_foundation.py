@@ -128,7 +128,7 @@ def test_an_open_insert_is_refused():
         sample_surface(Surface(closed.vertices, closed.faces[up], "lid"), 1e-3)
 
 
-def test_pressure_laws():
+def test_pressure_laws_have_their_closed_forms():
     strain = np.array([0.0, 1e-6, 0.01, 0.1, 0.4])
     assert np.allclose(layer_pressure("linear", LINEAR, strain), M * strain)
     assert np.allclose(layer_pressure("nonlinear", LINEAR, strain), -M * np.log1p(-strain))
@@ -165,17 +165,17 @@ def test_two_condyles_share_the_load_by_their_penetrations():
     model = LinearFoundation(1e-3)
     state = model.prepare(ContactPair(two_spheres(), flat_insert(HEIGHT, half_z=28e-3), LINEAR))
     level = model.press(state, 1500.0, np.eye(4))
-    missed = abs(1.0 + level.wrench_on_insert[1] / 1500.0)
-    assert 1e-12 < level.residual == pytest.approx(missed, rel=1e-3)
+    residual = abs(1.0 + level.wrench_on_insert[1] / 1500.0)
+    assert 1e-12 < level.residual == pytest.approx(residual, rel=1e-3)
     assert level.medial.force == pytest.approx(750, rel=1e-6)
     assert level.lateral.force == pytest.approx(750, rel=1e-6)
     assert level.medial.centre_of_pressure == pytest.approx([0, HEIGHT, -12e-3], abs=1e-5)
     assert level.lateral.centre_of_pressure == pytest.approx([0, HEIGHT, 12e-3], abs=1e-5)
     varus = model.press(state, 1500.0, knee_pose([0, 0, 0, 0, np.radians(0.3), 0]))
-    apart = 24e-3 * np.sin(np.radians(0.3))
+    height_difference = 24e-3 * np.sin(np.radians(0.3))
     deeper = (varus.medial.peak_pressure - varus.lateral.peak_pressure) * HEIGHT / M
     assert varus.medial.force + varus.lateral.force == pytest.approx(1500, rel=1e-6)
-    assert deeper == pytest.approx(apart, rel=0.01)
+    assert deeper == pytest.approx(height_difference, rel=0.01)
 
 
 def test_varus_loads_the_medial_condyle():
@@ -219,9 +219,9 @@ def test_out_of_range_is_nan_with_a_reason():
     deep = model.evaluate(state, lowered(6e-3))
     assert deep.status is ContactStatus.OUT_OF_RANGE
     assert np.isnan(deep.pressure).all()
-    too_much = model.press(state, 1e7, lowered(0))
-    assert too_much.status is ContactStatus.OUT_OF_RANGE
-    assert "half the insert's thickness" in " ".join(too_much.flags)
+    overloaded = model.press(state, 1e7, lowered(0))
+    assert overloaded.status is ContactStatus.OUT_OF_RANGE
+    assert "half the insert's thickness" in " ".join(overloaded.flags)
     beside = model.press(state, 100.0, lowered(0, x=60e-3))
     assert beside.status is ContactStatus.OUT_OF_RANGE
     assert "does not lie over the insert" in beside.flags[0]
@@ -272,39 +272,39 @@ def test_the_femur_over_an_edge_has_its_own_message():
 def test_near_columns_go_out_of_range_like_all_columns(share, monkeypatch):
     model = ElasticFoundation(1e-3)
     state = model.prepare(sphere_on_block(material("polyethylene")))
-    most = -model.evaluate(state, lowered(0.4999 * HEIGHT)).wrench_on_insert[1]
-    looked, evaluate = [], ElasticFoundation.evaluate
+    largest_load = -model.evaluate(state, lowered(0.4999 * HEIGHT)).wrench_on_insert[1]
+    evaluations, evaluate = [], ElasticFoundation.evaluate
 
     def counted(self, *arguments):
-        looked.append(1)
+        evaluations.append(1)
         return evaluate(self, *arguments)
 
     monkeypatch.setattr(ElasticFoundation, "evaluate", counted)
-    result = model.press(state, share * most, lowered(0))
-    few = len(looked)
-    whole = press_by_search(model, state, share * most, lowered(0))
-    assert result.status is whole.status
+    result = model.press(state, share * largest_load, lowered(0))
+    near_count = len(evaluations)
+    expected = press_by_search(model, state, share * largest_load, lowered(0))
+    assert result.status is expected.status
     assert (result.status is ContactStatus.OK) == (share < 1.0)
-    assert result.flags == whole.flags
-    np.testing.assert_allclose(result.approach, whole.approach, rtol=1e-6)
+    assert result.flags == expected.flags
+    np.testing.assert_allclose(result.approach, expected.approach, rtol=1e-6)
     assert (
-        few <= 2 < len(looked) - few
+        near_count <= 2 < len(evaluations) - near_count
     )  # all columns are evaluated at the end, and once at the end of the range
 
 
-@pytest.mark.parametrize("aside", [0.0, 1.0e-3, 3.0e-3, 12.0e-3])
-def test_a_guess_saves_evaluations_and_does_not_change_the_result(aside, monkeypatch):
+@pytest.mark.parametrize("distance", [0.0, 1.0e-3, 3.0e-3, 12.0e-3])
+def test_a_guess_saves_evaluations_and_does_not_change_the_result(distance, monkeypatch):
     """From a neighbouring pose the guess selects the columns; from a far pose all columns are
     evaluated.
     """
     model = ElasticFoundation(1e-3)
     state = model.prepare(sphere_on_block(material("polyethylene")))
     alone = model.press(state, 1500.0, lowered(0))
-    before = model.press(state, 1500.0, lowered(0, x=-aside))
-    looked = []
+    before = model.press(state, 1500.0, lowered(0, x=-distance))
+    evaluations = []
 
     def counted(samples, *arguments):
-        looked.append(len(samples.points))
+        evaluations.append(len(samples.points))
         return gaps_and_facets(samples, *arguments)
 
     monkeypatch.setattr(contact_samples, "gaps_and_facets", counted)
@@ -313,7 +313,7 @@ def test_a_guess_saves_evaluations_and_does_not_change_the_result(aside, monkeyp
     assert result.residual <= PRESS.load_tolerance
     np.testing.assert_allclose(result.approach, alone.approach, rtol=1e-6)
     nearer_than = contact_samples.FARTHEST / contact_samples.OBLIQUE
-    assert (looked[0] < len(state.points)) == (aside < nearer_than)
+    assert (evaluations[0] < len(state.points)) == (distance < nearer_than)
 
 
 def test_a_failed_guess_or_one_with_other_map_points_is_not_used():
@@ -376,7 +376,7 @@ def test_first_touch_of_crossed_cylinders_is_found_on_their_edges():
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="the data folder shared/data is not here")
+@pytest.mark.skipif(not DATA.is_dir(), reason="the measured data are missing")
 def test_a_real_implant_is_loaded_on_both_dishes():
     """The aligned components of JW, 1500 N: even split, centres of pressure in the dishes."""
     from tkamb.run.press import press_meshes

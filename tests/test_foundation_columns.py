@@ -19,31 +19,31 @@ OFFSETS = [(0, 0), (0.5, 0.5), (0.5, 0), (0.25, 0.25), (0.13, 0.37)]
 
 
 def box(low, high, turn_out=True):
-    """Return a box of 30 x 30 mm between y = low and high (mm); inside out for a void."""
-    made = (
+    """Return a box of 30 x 30 mm, or a void of 8 x 8 mm, between y = low and high (mm)."""
+    mesh = (
         trimesh.creation.box((30, high - low, 30))
         if turn_out
         else trimesh.creation.box((8, high - low, 8))
     )
-    made.apply_translation((0, (low + high) / 2, 0))
-    faces = np.asarray(made.faces, np.int64)
-    return Surface(np.asarray(made.vertices) * MM, faces if turn_out else faces[:, ::-1], "insert")
+    mesh.apply_translation((0, (low + high) / 2, 0))
+    faces = np.asarray(mesh.faces, np.int64)
+    return Surface(np.asarray(mesh.vertices) * MM, faces if turn_out else faces[:, ::-1], "insert")
 
 
 def meshed(surface, times):
-    made = surface.mesh
+    mesh = surface.mesh
     for _ in range(times):
-        made = made.subdivide()
-    return Surface(np.asarray(made.vertices), np.asarray(made.faces, np.int64), "insert")
+        mesh = mesh.subdivide()
+    return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64), "insert")
 
 
-WHOLE = box(0, 10)
+SOLID = box(0, 10)
 INSERTS = {
     "two layers": joined(box(0, 4), box(4, 10)),
     "two layers, the wall meshed in two ways": joined(box(0, 4), meshed(box(4, 10), 2)),
     "three layers": joined(box(0, 3), box(3, 5), box(5, 10)),
-    "a closed void": joined(WHOLE, box(2, 5, turn_out=False)),
-    "a hollow under the top": joined(WHOLE, box(1, 8, turn_out=False)),
+    "a closed void": joined(SOLID, box(2, 5, turn_out=False)),
+    "a hollow under the top": joined(SOLID, box(1, 8, turn_out=False)),
 }
 
 
@@ -58,16 +58,16 @@ def test_a_column_ends_where_it_finally_leaves_the_insert(name):
 @pytest.mark.parametrize("name", INSERTS)
 @pytest.mark.parametrize("model", [LinearFoundation, ElasticFoundation])
 def test_walls_and_voids_do_not_change_the_pressure(name, model):
-    result, whole = (
+    result, solid = (
         model(1 * MM).press(
             model(1 * MM).prepare(ContactPair(graded_sphere(30 * MM), insert, LINEAR)),
             800.0,
             np.eye(4),
         )
-        for insert in (INSERTS[name], WHOLE)
+        for insert in (INSERTS[name], SOLID)
     )
-    assert result.medial.peak_pressure == pytest.approx(whole.medial.peak_pressure, rel=1e-6)
-    assert result.approach == pytest.approx(whole.approach, rel=1e-6)
+    assert result.medial.peak_pressure == pytest.approx(solid.medial.peak_pressure, rel=1e-6)
+    assert result.approach == pytest.approx(solid.approach, rel=1e-6)
 
 
 def narrow(result):
@@ -81,15 +81,15 @@ def test_the_peak_of_a_sphere_is_correct_or_flagged(size):
     model = LinearFoundation(size * MM)
     insert = flat_insert(height, half_x=20 * MM, half_z=20 * MM)
     state = model.prepare(ContactPair(graded_sphere(radius), insert, LINEAR))
-    off = []
+    peaks = []
     for load in (1.0, 10.0, 60.0, 200.0, 800.0, 1500.0, 5000.0):
         depths = np.linspace(0, 3 * MM, 300001)
         force = M / height * np.pi * depths**2 * (radius - depths / 3)
         exact = M / height * np.interp(load, force, depths)
         for x, z in np.array(OFFSETS) * size * MM:
             result = model.press(state, load, pose(np.eye(3), [x, 0, z]))
-            off.append((narrow(result), result.medial.peak_pressure / exact - 1))
-    flagged, error = (np.array(column) for column in zip(*off, strict=True))
+            peaks.append((narrow(result), result.medial.peak_pressure / exact - 1))
+    flagged, error = (np.array(column) for column in zip(*peaks, strict=True))
     assert np.abs(error[~flagged]).max() < 0.08
     assert error[flagged].min() < -0.5
     assert 0.2 < flagged.mean() < 0.95

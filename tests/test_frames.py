@@ -16,8 +16,8 @@ from tkamb.units import DEGREE
 
 
 def test_signs_are_those_of_grood_and_suntay():
-    """Flexion turns the femur's shaft backwards, varus opens laterally, external rotation turns it
-    out.
+    """Flexion turns the shaft backwards, varus lifts the lateral condyle, and external rotation
+    turns the front outwards.
     """
     shaft, anterior = np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])
     lateral_condyle = np.array([0.0, 0.0, 0.02])
@@ -38,10 +38,10 @@ def test_coordinates_of_a_pose_are_recovered_to_160_degrees():
 
 def test_other_angle_orders_are_converted_by_the_rotation_matrix():
     angles = np.array([0.3, -0.4, 1.1])
-    given = pose(Rotation.from_euler("XYZ", angles).as_matrix(), np.zeros(3))
-    again = knee_pose(knee_coordinates(given))
-    np.testing.assert_allclose(again, given, atol=1e-14)
-    assert abs(knee_coordinates(given)[4] + angles[0]) > 0.01
+    original = pose(Rotation.from_euler("XYZ", angles).as_matrix(), np.zeros(3))
+    recovered = knee_pose(knee_coordinates(original))
+    np.testing.assert_allclose(recovered, original, atol=1e-14)
+    assert abs(knee_coordinates(original)[4] + angles[0]) > 0.01
 
 
 def test_twist_is_the_derivative_of_the_pose():
@@ -57,7 +57,7 @@ def test_twist_is_the_derivative_of_the_pose():
     )
 
 
-def test_inverse_and_mirror():
+def test_inverse_and_mirror_image_of_a_pose_are_exact():
     femoral_pose = knee_pose([0.01, 0.03, 0.002, 0.1, 0.05, 1.0])
     np.testing.assert_allclose(femoral_pose @ inverse(femoral_pose), np.eye(4), atol=1e-15)
     c = knee_coordinates(mirrored_pose(femoral_pose))

@@ -1,17 +1,15 @@
-"""Loads of tkamb against free bodies that are computed from the raw files alone.
+"""Loads of tkamb agree with those of free bodies, which are computed from the raw files.
 
-Own here (`raw_files`, `raw_leg`, `free_body`: numpy and scipy, no import of tkamb): reading of
-scene, URDF, tables, markers and STL; the documented smoothing spline; the rigid fit of the
-shank; poses of all segments by the URDF's joints; accelerations and spins by differences of
-those poses; masses and inertias; the ground reaction as a wrench; ligament lengths and
-tensions; direction of sliding; the equations themselves (shank with foot 6, patella 3, thigh
-with patella 6, in the laboratory, instead of the product's 15 generalised ones).
+`raw_files`, `raw_leg` and `free_body` use numpy and scipy, but not tkamb. They read scene, URDF,
+tables, markers and STL, apply the documented smoothing spline, and fit the shank's markers. They
+compute the poses of all segments from the URDF's joints, the accelerations by differences of those
+poses, the ground reaction as a wrench, ligament tensions, and the direction of sliding. Their
+equations are in the laboratory: 6 for shank with foot, 3 for the patella, 6 for thigh with patella.
 
-Shared, all of it geometry: the condyles' contact points and normals, the lines of action of
-quadriceps and patellar ligament with what they wrap, patellofemoral point and normal, which
-condyle carries nothing and whether the quadriceps is slack. For DM also where the insert's
-mesh lies in the insert frame (the rectangle around a noisy flat) and the solved places of
-the patella. Where a line wraps nothing, it is compared with the scene's own two points.
+tkamb supplies geometry: contact points and normals of condyles and patella, the lines of quadriceps
+and patellar ligament, unloaded condyles, and whether the quadriceps is slack. For DM it also
+supplies the pose of the insert's mesh and the solved positions of the patella. A line that wraps
+nothing is compared with the scene's two points.
 """
 
 from pathlib import Path
@@ -35,9 +33,10 @@ DATA = Path(__file__).parents[2] / "shared" / "data" / "dm"
 SHIPPED, DM = MODELS / "deep_knee_bend" / "scene.toml", MODELS / "dm" / "scene.toml"
 SHIPPED_FRAMES = (8, 22, 40, 58, 76, 93)
 DM_FRAMES = (2, 5, 9, 12, 14, 16)
-"""Of 21 frames, one every 5 % of the cycle: both condyles, one alone, quadriceps slack, swing."""
+"""Frames of 21, one every 5 % of the cycle: contact of both condyles or one, slack quadriceps,
+swing."""
 FORCE, MOMENT = 1.0, 0.1
-"""N and N·m within which the two must agree."""
+"""N and N·m: largest accepted difference between tkamb and the free bodies."""
 
 
 needs_dm = pytest.mark.skipif(
@@ -72,7 +71,7 @@ def test_the_shipped_knee_is_in_balance_on_free_bodies(shipped, k):
 
 
 @pytest.mark.parametrize("k", SHIPPED_FRAMES[1::2])
-def test_it_stays_so_with_muscles_across_the_knee(shipped, monkeypatch, k):
+def test_the_shipped_knee_with_muscles_across_it_is_in_balance(shipped, monkeypatch, k):
     leg, mechanics, time = shipped
     monkeypatch.setattr(mechanics, "muscles", SharedMuscles(two_flexors(len(time))))
     frame = mechanics.frame(k)
@@ -90,17 +89,19 @@ def test_dm_is_in_balance_on_free_bodies(dm, k):
 def assert_same_loads(leg, frame, t):
     """Assert that tkamb and the free bodies agree on every common load."""
     assert not frame.loads.problems
-    own = FreeBodies(leg, t, lent(frame)).loads()
+    reference = FreeBodies(leg, t, lent(frame)).loads()
     for k, axis in enumerate(("ap", "si", "ml")):
-        own[f"hip_force_{axis}"] = own["hip_force"][k]
-        own[f"hip_moment_{axis}"] = own["hip_moment"][k]
-    del own["hip_force"], own["hip_moment"]
-    product = frame.loads.values
-    assert set(own) >= {name for name in product if "rest" not in name and product[name] != 0.0}
-    apart = {name: product[name] - value for name, value in own.items()}
+        reference[f"hip_force_{axis}"] = reference["hip_force"][k]
+        reference[f"hip_moment_{axis}"] = reference["hip_moment"][k]
+    del reference["hip_force"], reference["hip_moment"]
+    values = frame.loads.values
+    assert set(reference) >= {name for name in values if "rest" not in name and values[name] != 0.0}
+    differences = {name: values[name] - value for name, value in reference.items()}
     moments = ("moment", "axial", "coronal", "flexion")
-    limit = {name: MOMENT if any(word in name for word in moments) else FORCE for name in apart}
-    assert not {name: d for name, d in apart.items() if abs(d) > limit[name]}
+    limit = {
+        name: MOMENT if any(word in name for word in moments) else FORCE for name in differences
+    }
+    assert not {name: d for name, d in differences.items() if abs(d) > limit[name]}
 
 
 def lent(frame):
@@ -135,22 +136,23 @@ def test_lines_that_wrap_nothing_run_between_the_scenes_points(shipped):
         lines = {"patellar_ligament": extensor.patellar_ligament}
         if extensor.wrap == 0.0:
             lines["quadriceps"] = geometry.muscles[0].loads
-        back = np.linalg.inv(leg.insert_in_laboratory(time[k]))
+        laboratory_in_insert = np.linalg.inv(leg.insert_in_laboratory(time[k]))
         for name, loads in lines.items():
             for (end, place), load in zip(leg.ends(name, time[k]), loads, strict=True):
                 assert load.link in (end, leg.body(end))
-                assert np.allclose(load.points[0], (back @ np.append(place, 1.0))[:3], atol=1e-9)
+                assert np.allclose(
+                    load.points[0], (laboratory_in_insert @ np.append(place, 1.0))[:3], atol=1e-9
+                )
 
 
 def test_the_free_bodies_notice_a_load_that_is_wrong_by_one_per_cent(shipped):
-    """The comparison fails if the ground reaction changes by one per cent."""
     leg, mechanics, time = shipped
     k, ground = SHIPPED_FRAMES[3], leg.ground
-    own = FreeBodies(leg, time[k], lent(mechanics.frame(k))).loads()
+    reference = FreeBodies(leg, time[k], lent(mechanics.frame(k))).loads()
     leg.ground = lambda t: 1.01 * ground(t)
     try:
-        more = FreeBodies(leg, time[k], lent(mechanics.frame(k))).loads()
+        changed = FreeBodies(leg, time[k], lent(mechanics.frame(k))).loads()
     finally:
         leg.ground = ground
-    assert abs(more["muscle_quadriceps"] - own["muscle_quadriceps"]) > 10 * FORCE
-    assert np.abs(more["hip_moment"] - own["hip_moment"]).max() > 5 * MOMENT
+    assert abs(changed["muscle_quadriceps"] - reference["muscle_quadriceps"]) > 10 * FORCE
+    assert np.abs(changed["hip_moment"] - reference["hip_moment"]).max() > 5 * MOMENT

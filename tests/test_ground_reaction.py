@@ -49,10 +49,10 @@ def test_loaded_foot_is_reproduced(tmp_path):
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("which", [0, 1, 2])
-def test_an_infinite_cell_is_refused(tmp_path, which):
+@pytest.mark.parametrize("quantity", [0, 1, 2])
+def test_an_infinite_cell_is_refused(tmp_path, quantity):
     measured = [values.copy() for values in step(STAMPS)]
-    measured[which][7, 0] = np.inf
+    measured[quantity][7, 0] = np.inf
     with pytest.raises(InputError, match="line 9 holds 'inf', which is not finite"):
         load_ground_reaction(plate(write(tmp_path / "g.csv", *measured)), AT, "right")
 
@@ -98,11 +98,11 @@ def test_the_point_of_an_unloaded_plate_does_not_change_the_wrench(tmp_path):
     )
     assert high.loaded.sum() < low.loaded.sum()
     np.testing.assert_array_equal(low.force, high.force)
-    arm = np.linalg.norm(about_origin(low) - about_origin(high), axis=1)
-    assert arm.max() < 0.5  # N·m, from holding the recorded points of 20 to 100 N
+    moment_change = np.linalg.norm(about_origin(low) - about_origin(high), axis=1)
+    assert moment_change.max() < 0.5  # N·m, from holding the recorded points of 20 to 100 N
 
 
-def test_laboratory_axes_and_left_foot(tmp_path):
+def test_laboratory_axes_and_a_left_foot_give_the_same_reaction(tmp_path):
     force, point, moment = step(STAMPS)
     right = load_ground_reaction(
         plate(write(tmp_path / "r.csv", force, point, moment)), AT, "right"
@@ -141,7 +141,7 @@ def test_force_on_the_plate_is_the_opposite_of_that_on_the_foot(tmp_path):
         load_ground_reaction(plate(foot, force="on the plate"), AT, "left")
 
 
-def test_millimetres_and_absent_free_moment(tmp_path):
+def test_millimetres_and_an_absent_free_moment_are_read(tmp_path):
     force, point, moment = step(STAMPS)
     metres = load_ground_reaction(
         plate(write(tmp_path / "m.csv", force, point, 0 * moment)), AT, "right"
@@ -155,7 +155,7 @@ def test_millimetres_and_absent_free_moment(tmp_path):
     np.testing.assert_allclose(result.moment, metres.moment, atol=1e-9)
 
 
-def test_plate_that_is_never_loaded(tmp_path):
+def test_a_plate_that_is_never_loaded_has_finite_points(tmp_path):
     force, point, moment = step(STAMPS)
     reaction = load_ground_reaction(
         plate(write(tmp_path / "g.csv", 0.01 * force, np.nan * point, 0 * moment)), AT, "right"
@@ -171,7 +171,7 @@ def refused(tmp_path, message, force, point, moment, **changes):
         load_ground_reaction(plate(file, **changes), AT, "right")
 
 
-def test_refusals(tmp_path):
+def test_invalid_plate_files_are_refused(tmp_path):
     force, point, moment = step(STAMPS)
     lost = point.copy()
     lost[1000] = np.nan
@@ -193,9 +193,9 @@ def test_the_height_of_a_plate_may_be_missing(tmp_path):
     """The plate is then at the height 0; a missing horizontal column is refused."""
     force, point, moment = step(STAMPS)
     point[:, 1] = 0.0
-    given = write(tmp_path / "given.csv", force, point, moment)
-    rows = [line.split(",") for line in given.read_text(encoding="utf-8").splitlines()]
-    expected = load_ground_reaction(plate(given), AT, "right")
+    complete = write(tmp_path / "given.csv", force, point, moment)
+    rows = [line.split(",") for line in complete.read_text(encoding="utf-8").splitlines()]
+    expected = load_ground_reaction(plate(complete), AT, "right")
     for role, file in (("point_2", "height.csv"), ("point_3", "side.csv")):
         remaining = [k for k, name in enumerate(rows[0]) if name != role]
         text = "\n".join(",".join(row[k] for k in remaining) for row in rows)

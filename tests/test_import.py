@@ -37,14 +37,14 @@ AXES = "-x,+y,-z"
 
 def test_a_model_without_implant_becomes_a_scene_that_loads_and_bends(tmp_path, capsys):
     assert main(recorded_leg(tmp_path)) == 0
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     scene = load_scene(tmp_path / "out" / "scene.toml")
     assert scene.contact is None and scene.motion.markers is not None
-    assert "not scaled" in said and "+x,+y,+z" in said and "no implant" in said
-    assert "flexion 5.7 to 67.7 deg" in said  # 0.1 rad to 1.2 less one frame in sixty
+    assert "not scaled" in output and "+x,+y,+z" in output and "no implant" in output
+    assert "flexion 5.7 to 67.7 deg" in output  # 0.1 to 1.18 rad: the last of 60 frames is skipped
 
 
-def test_a_run_on_markers_holds_both_readings_frame_by_frame(tmp_path):
+def test_results_of_a_run_on_markers_have_both_fits(tmp_path):
     assert main(recorded_leg(tmp_path)) == 0
     results = tkamb.simulate(tmp_path / "out" / "scene.toml")
     for method in ("segments", "chain"):
@@ -56,33 +56,35 @@ def test_a_run_on_markers_holds_both_readings_frame_by_frame(tmp_path):
     assert "skin markers" in " ".join(results.summary["assumptions"])
 
 
-@pytest.mark.parametrize(("off", "asked"), [(10.0, 0), (14.0, 1)])
-def test_markers_of_another_subject_are_asked_about(tmp_path, off, asked):
+@pytest.mark.parametrize(("offset", "asked"), [(10.0, 0), (14.0, 1)])
+def test_markers_of_another_subject_are_asked_about(tmp_path, offset, asked):
     """If marker clusters grow by the share c, the rms of a rigid fit is c times the radius."""
     assert main(recorded_leg(tmp_path)) == 0
     scene = load_scene(tmp_path / "out" / "scene.toml")
     segments = scene.motion.markers.segment[:2]
-    assert {one.name for one in segments} == {"shank", "thigh"}
-    clusters = [np.array(list(one.markers_mm.values())) for one in segments]
+    assert {segment.name for segment in segments} == {"shank", "thigh"}
+    clusters = [np.array(list(segment.markers_mm.values())) for segment in segments]
     radii = np.concatenate([cluster - cluster.mean(axis=0) for cluster in clusters])
-    larger = 1 + off / np.sqrt((radii**2).sum(axis=1).mean())
-    for one in segments:
-        for name, place in one.markers_mm.items():
-            one.markers_mm[name] = tuple(larger * np.array(place))
-    questions = [str(one) for one in marker_questions(load_case(scene))]
+    larger = 1 + offset / np.sqrt((radii**2).sum(axis=1).mean())
+    for segment in segments:
+        for name, place in segment.markers_mm.items():
+            segment.markers_mm[name] = tuple(larger * np.array(place))
+    questions = [str(question) for question in marker_questions(load_case(scene))]
     assert len(questions) == asked
-    assert all("thigh's markers lie 14 mm (rms)" in one for one in questions)
+    assert all(
+        "the markers of shank and thigh lie 14 mm (rms)" in question for question in questions
+    )
 
 
-def test_what_is_inferred_stands_in_the_scene(tmp_path):
+def test_the_scene_states_inferred_values(tmp_path):
     assert main(recorded_leg(tmp_path)) == 0
     text = (tmp_path / "out" / "scene.toml").read_text()
     for key in ("laboratory_axes", "interval_s", "neutral_mm", "markers_mm", "method"):
         assert key in text
-    assert '"S:' not in text  # the subject's prefix is not part of a marker's name
+    assert '"S:' not in text  # The subject's prefix is not part of a marker's name.
 
 
-def test_the_models_own_chain_gives_the_coordinates_back(tmp_path):
+def test_the_fit_of_a_model_returns_its_coordinates(tmp_path):
     osim = pendulum_osim(tmp_path / "leg.osim")
     q, markers = moving_leg(osim)
     write_trc(tmp_path / "leg.trc", np.arange(60) / 60.0, markers, 60.0)
@@ -91,17 +93,17 @@ def test_the_models_own_chain_gives_the_coordinates_back(tmp_path):
     np.testing.assert_allclose(fit.state, q, atol=1e-6)  # the file has 1e-8 m
 
 
-def test_the_models_normal_equations_are_those_of_its_markers(tmp_path):
+def test_normal_equations_agree_with_finite_differences(tmp_path):
     check_normal_equations(read_osim(pendulum_osim(tmp_path / "leg.osim")))
 
 
 @needs_jw
-def test_they_are_with_joints_passed_backwards_and_couplers():
+def test_normal_equations_agree_with_backwards_joints_and_couplers():
     check_normal_equations(read_osim(JW / "JW.osim"))
 
 
 def check_normal_equations(model):
-    """Gradient and Hessian of the cost agree with finite differences."""
+    """Assert that gradient and Hessian of the cost agree with finite differences."""
     chain = ModelChain(model, list(model.markers))
     rng = np.random.default_rng(2)
     q = chain.kinematics.coupled(rng.normal(0.0, 0.3, (3, len(model.coordinates))))
@@ -113,19 +115,19 @@ def check_normal_equations(model):
     for k in range(len(chain.free)):
         step = np.zeros((3, len(chain.free)))
         step[:, k] = 1e-6
-        moved = [chain.moved(q, s * step) for s in (1, -1)]
-        ahead, behind = (chain.places(state) for state in moved)
+        shifted = [chain.moved(q, s * step) for s in (1, -1)]
+        ahead, behind = (chain.places(state) for state in shifted)
         jacobian[..., k] = (ahead - behind) / 2e-6
-        ahead, behind = (chain.normal(state, target, weights).right for state in moved)
+        ahead, behind = (chain.normal(state, target, weights).right for state in shifted)
         hessian[..., k] = -(ahead - behind) / 2e-6
-    found = chain.normal(q, target, weights)
-    off = target - chain.places(q)
-    np.testing.assert_allclose(found.cost, np.einsum("fm,fmi,fmi->f", weights, off, off))
-    right = np.einsum("fm,fmin,fmi->fn", weights, jacobian, off)
-    np.testing.assert_allclose(found.right, right, atol=1e-8)
+    result = chain.normal(q, target, weights)
+    offset = target - chain.places(q)
+    np.testing.assert_allclose(result.cost, np.einsum("fm,fmi,fmi->f", weights, offset, offset))
+    right = np.einsum("fm,fmin,fmi->fn", weights, jacobian, offset)
+    np.testing.assert_allclose(result.right, right, atol=1e-8)
     matrix = np.einsum("fm,fmin,fmik->fnk", weights, jacobian, jacobian)
-    np.testing.assert_allclose(found.matrix, matrix, atol=1e-7)
-    np.testing.assert_allclose(found.matrix + found.curvature, hessian, atol=1e-7)
+    np.testing.assert_allclose(result.matrix, matrix, atol=1e-7)
+    np.testing.assert_allclose(result.matrix + result.curvature, hessian, atol=1e-7)
 
 
 def test_a_motion_in_the_models_coordinates_is_read_through_its_kinematics(tmp_path, capsys):
@@ -199,7 +201,10 @@ MISTAKES = {
     "interval of words": (lambda a, d: changed(a, interval="start:end"), "interval"),
     "plates of words": (lambda a, d: changed(a, plates="left"), "plates"),
     "ground reaction not there": (lambda a, d: changed(a, grf=str(d / "g.mot")), "no such file"),
-    "ground reaction of no foot": (lambda a, d: changed(a, grf=str(nobodys(d))), "which force"),
+    "ground reaction of no foot": (
+        lambda a, d: changed(a, grf=str(unnamed_forces(d))),
+        "which force",
+    ),
     "standing trial not there": (lambda a, d: changed(a, static=str(d / "s.c3d")), "no such file"),
     "unknown method": (lambda a, d: changed(a, method="magic"), "method"),
     "out is a file": (lambda a, d: changed(a, out=str(d / "leg.trc")), "leg.trc"),
@@ -237,7 +242,7 @@ def rename(folder: Path) -> Path:
     return path
 
 
-def nobodys(folder: Path) -> Path:
+def unnamed_forces(folder: Path) -> Path:
     time = np.arange(60) / 60.0
     names = [f"plate{k}_v{a}" for k in (1, 2) for a in "xyz"]
     write_storage(folder / "g.mot", {"time": time} | dict.fromkeys(names, 0 * time), False)
@@ -262,7 +267,7 @@ def test_a_mistake_is_one_line_and_nothing_is_written(tmp_path, capsys, mistake)
     assert not (tmp_path / "out").exists()
 
 
-def test_a_scene_that_is_there_is_kept(tmp_path, capsys):
+def test_an_existing_scene_is_not_replaced(tmp_path, capsys):
     arguments = recorded_leg(tmp_path)
     assert main(arguments) == 0
     before = (tmp_path / "out" / "scene.toml").read_text()
@@ -271,7 +276,7 @@ def test_a_scene_that_is_there_is_kept(tmp_path, capsys):
     assert (tmp_path / "out" / "scene.toml").read_text() == before
 
 
-def test_quarter_turns():
+def test_the_nearest_quarter_turn_is_returned():
     turn = np.array([[0.1, -0.99, 0.05], [-0.99, -0.1, 0.02], [0.0, 0.05, -1.0]])
     axes, _ = quarter_turn(turn)
     np.testing.assert_array_equal(axes, [[0, -1, 0], [-1, 0, 0], [0, 0, -1]])
@@ -280,12 +285,12 @@ def test_quarter_turns():
 @pytest.mark.skipif(not DATA.is_dir(), reason="no shared data beside the project")
 @pytest.mark.parametrize("name", ["gait2392", "Rajagopal2016"])
 @pytest.mark.parametrize("side", ["right", "left"])
-def test_widely_used_models_have_legs_too(name, side):
+def test_the_legs_of_widely_used_models_are_found(name, side):
     leg = find_leg(read_osim(DATA / "opensim" / f"{name}.osim"), side)
     links = find_links(leg, None, "+x,+y,+z", {}, False)
     assert leg.knee.name.endswith("_" + side[0]) and leg.flexion == f"knee_angle_{side[0]}"
-    assert 0.3 < links.insert_in_tibia[1, 3] < 0.5  # m, from the ankle up to the knee
-    assert 0.3 < links.hip[1] < 0.5  # and from there to the hip
+    assert 0.3 < links.insert_in_tibia[1, 3] < 0.5  # m, from ankle to knee
+    assert 0.3 < links.hip[1] < 0.5  # m, from knee to hip
     ElementTree.fromstring(patient_urdf(links, 1.0, ""))
 
 
@@ -320,8 +325,8 @@ def test_jws_markers_fit_no_worse_than_opensims_tool():
         part |= {f"{label}_{a}": path[:120:12, k] for k, a in enumerate("xyz")}
     _, fit = fit_model(model, type(recorded)(recorded.path, part, "m"))
     assert fit.solved.all()
-    # OpenSim 4.6, InverseKinematicsTool on the same model, markers and weights, ranges not
-    # clamped, accuracy 1e-5: mm at these frames
+    # mm: rms of OpenSim 4.6's InverseKinematicsTool at these frames, with the same model, markers
+    # and weights, ranges not clamped, accuracy 1e-5.
     tool = [11.774, 10.274, 9.1, 9.46, 12.928, 14.196, 13.894, 14.78, 12.918, 11.831]
     assert np.all(fit.rms < 1e-3 * (np.array(tool) + 0.002))
     assert fit.rms.mean() < 1e-3 * np.mean(tool)
@@ -340,8 +345,8 @@ def test_the_script_writes_the_scenes_that_are_shipped(tmp_path):
     patient = import_patient(script.request(JW, "ngait_og3"), ROOT / "models/jw")
     assert patient.scene.text() == (ROOT / "models/jw/ngait_og3.toml").read_text()
     assert patient.urdf == (ROOT / "models/jw/patient.urdf").read_text()
-    said = "\n".join(patient.report)
-    assert "force plate 2: right" in said and "force plate 1: left" in said
+    output = "\n".join(patient.report)
+    assert "force plate 2: right" in output and "force plate 1: left" in output
     assert patient.scene.ground is not None and patient.scene.ground.plates == (2, 3)
 
 
@@ -362,9 +367,9 @@ def test_storage_and_trc_come_back_as_written(tmp_path):
     places = np.random.default_rng(0).normal(0, 1, (5, 3))
     places[2] = np.nan
     write_trc(tmp_path / "a.trc", time, {"A": places, "B": places + 1}, 50.0)
-    back = read_table(tmp_path / "a.trc")
-    found = np.stack([back.columns[f"B_{a}"] for a in "xyz"], axis=1)
-    np.testing.assert_allclose(found * 1e-3, places + 1, atol=1e-8)
-    np.testing.assert_allclose(back.columns["time"], time)
+    table = read_table(tmp_path / "a.trc")
+    result = np.stack([table.columns[f"B_{a}"] for a in "xyz"], axis=1)
+    np.testing.assert_allclose(result * 1e-3, places + 1, atol=1e-8)
+    np.testing.assert_allclose(table.columns["time"], time)
     with pytest.raises(InputError, match="blank"):
         write_storage(tmp_path / "b.sto", {"time": time, "a b": time}, in_degrees=False)

@@ -42,7 +42,7 @@ needs_dm = pytest.mark.skipif(
 
 
 def write_poses(path: Path, time: np.ndarray, poses: np.ndarray) -> Path:
-    """Write poses (n, 4, 4) m of the femoral mesh in the insert mesh, rad."""
+    """Write poses (n, 4, 4), m, of the femoral mesh in the insert mesh, with angles in rad."""
     angles = Rotation.from_matrix(poses[:, :3, :3]).as_euler("XYZ")
     values = np.concatenate([angles, poses[:, :3, 3]], axis=1)
     write_storage(path, {"time": time} | dict(zip(ROLES, values.T, strict=True)), in_degrees=False)
@@ -51,7 +51,7 @@ def write_poses(path: Path, time: np.ndarray, poses: np.ndarray) -> Path:
 
 @pytest.fixture(scope="module")
 def bent_leg(tmp_path_factory) -> tuple[list[str], np.ndarray, np.ndarray]:
-    """Write a knee bend as poses in per cent and as markers with one of the shank a gap.
+    """Write a knee bend as poses over per cent of a cycle, and as markers. One is never visible.
 
     Returns:
         The arguments of the import, and the poses of tibia and femur (n, 4, 4) in ground.
@@ -93,7 +93,7 @@ def bent_leg(tmp_path_factory) -> tuple[list[str], np.ndarray, np.ndarray]:
     return ["import", str(osim), *line], tibia, femur
 
 
-def test_the_femur_of_the_scene_stands_where_it_was(bent_leg, tmp_path, capsys):
+def test_the_scene_reproduces_the_recorded_shank_and_femur(bent_leg, tmp_path, capsys):
     """Two shank markers and two joint centres reproduce the recorded shank and knee.
 
     The knee is a pin joint, so that the thigh's markers give its centre exactly.
@@ -101,12 +101,12 @@ def test_the_femur_of_the_scene_stands_where_it_was(bent_leg, tmp_path, capsys):
     arguments, tibia, femur = bent_leg
     options = {"without": "M.foot_r.1", "out": str(tmp_path / "out")}
     assert main(changed(arguments, **options)) == 0
-    said = capsys.readouterr().out
-    assert "not recorded: M.tibia_r.0" in said and "thigh's 3 markers" in said
-    assert "plate_2_v*" in said and "left out, as given: M.foot_r.1" in said
+    output = capsys.readouterr().out
+    assert "not recorded: M.tibia_r.0" in output and "thigh's 3 markers" in output
+    assert "plate_2_v*" in output and "left out, as given: M.foot_r.1" in output
     scene = load_scene(tmp_path / "out" / "scene.toml")
-    carried = {centre.name: list(centre.markers_mm) for centre in scene.tibia.joint_centre}
-    assert carried["ankle_centre"] == ["M.foot_r.0", "M.foot_r.2", "M.foot_r.3"]
+    centre_markers = {centre.name: list(centre.markers_mm) for centre in scene.tibia.joint_centre}
+    assert centre_markers["ankle_centre"] == ["M.foot_r.0", "M.foot_r.2", "M.foot_r.3"]
     case = load_case(scene)
     assert case.motion.cycle_percent is not None and case.tibia is not None
     np.testing.assert_allclose(case.motion.time, np.arange(60) / 60.0, atol=1e-9)
@@ -140,11 +140,11 @@ def test_poses_out_of_the_sagittal_plane_keep_their_side(block, tmp_path, side):
     turns = Rotation.from_euler("XYZ", np.linspace([2, 5, 5], [-1, -4, 60], 11), degrees=True)
     poses = pose(turns.as_matrix(), np.linspace([1e-3, 0.01, 3e-3], [-2e-3, 0.012, 1e-3], 11))
     file = write_poses(tmp_path / "poses.sto", np.linspace(0, 1, 11), poses)
-    given = PoseRecording(file, ROLES, "XYZ", "rad", "m", stance=(0.2, 0.5))
-    found = read_poses(given, links, insert, AXES, 4.0, None)
+    recording = PoseRecording(file, ROLES, "XYZ", "rad", "m", stance=(0.2, 0.5))
+    result = read_poses(recording, links, insert, AXES, 4.0, None)
     ankle, offset = (pose(np.eye(3), [0.0, y, 0.0]) for y in (-0.42, -0.4))
-    np.testing.assert_allclose(found.femur, inverse(ankle) @ poses @ inverse(offset), atol=1e-7)
-    assert list(np.flatnonzero(found.in_stance)) == [2, 3, 4, 5]
+    np.testing.assert_allclose(result.femur, inverse(ankle) @ poses @ inverse(offset), atol=1e-7)
+    assert list(np.flatnonzero(result.in_stance)) == [2, 3, 4, 5]
 
 
 MISTAKES = {
@@ -191,9 +191,9 @@ def test_the_script_writes_dms_scenes_that_are_shipped(name):
     patient = import_patient(script.request(DM, name), ROOT / "models/dm")
     assert patient.scene.text() == (ROOT / "models/dm" / name).read_text()
     assert patient.urdf == (ROOT / "models/dm/patient.urdf").read_text()
-    said = "\n".join(patient.report)
-    assert "forward, up, right are the file's -x,+y,-z" in said
-    assert "knee 'knee_r'" in said and "88 femorotibial ligament strands" in said
+    output = "\n".join(patient.report)
+    assert "forward, up, right are the file's -x,+y,-z" in output
+    assert "knee 'knee_r'" in output and "88 femorotibial ligament strands" in output
 
 
 def test_dms_links_are_where_its_model_has_them():
@@ -207,9 +207,9 @@ def test_dms_links_are_where_its_model_has_them():
         ),
     }
     for name, values in by_hand.items():
-        found = " ".join(origins[name].get(key) for key in ("xyz", "rpy")).split()
+        result = " ".join(origins[name].get(key) for key in ("xyz", "rpy")).split()
         np.testing.assert_allclose(
-            np.array(found, float), np.array(values.split(), float), atol=1e-9
+            np.array(result, float), np.array(values.split(), float), atol=1e-9
         )
     scene = load_scene(ROOT / "models/dm/scene.toml")
     centres = {c.name: c.tibia_mm for c in scene.tibia.joint_centre}

@@ -49,7 +49,7 @@ TOUCHING = {
     "three layers": [slab(0, 0.003), slab(0.003, 0.006, (10, 1, 4)), slab(0.006, HEIGHT)],
     "side by side": [side(-WIDTH / 2, 0.0), side(0.0, WIDTH / 2, (10, 4, 3))],
 }
-PRESENT = {
+OVERLAPPING = {
     "overlapping": [slab(0, 0.006), slab(0.004, HEIGHT, (7, 1, 9))],
     "overlapping sideways": [side(-WIDTH / 2, 0.01), side(-0.01, WIDTH / 2)],
 }
@@ -74,14 +74,14 @@ def peak(insert, contact):
 
 
 @pytest.fixture(scope="module")
-def right(tmp_path_factory):
+def solid_peaks(tmp_path_factory):
     """Return the peak pressures of the solid block."""
     insert = read(tmp_path_factory.mktemp("solid"), [SOLID])
     return {contact: peak(insert, contact) for contact in ("foundation", "lattice-linear")}
 
 
 @pytest.mark.parametrize("name", TOUCHING)
-def test_a_wall_between_touching_bodies_is_removed(name, tmp_path, right, caplog):
+def test_a_wall_between_touching_bodies_is_removed(name, tmp_path, solid_peaks, caplog):
     with caplog.at_level(logging.WARNING, "tkamb"):
         insert = read(tmp_path, TOUCHING[name])
     if name != "meshed alike":  # both sides of this wall are removed as opposite duplicates
@@ -89,16 +89,16 @@ def test_a_wall_between_touching_bodies_is_removed(name, tmp_path, right, caplog
     assert insert.mesh.is_watertight
     assert insert.volume == pytest.approx(SOLID.volume, rel=1e-6)
     assert find_inner_wall(insert.vertices, insert.faces) is None
-    for contact, value in right.items():
+    for contact, value in solid_peaks.items():
         assert peak(insert, contact) == pytest.approx(value, rel=1e-3)
 
 
-@pytest.mark.parametrize("name", PRESENT)
-def test_overlapping_bodies_are_one_in_the_lattice(name, tmp_path, right, caplog):
+@pytest.mark.parametrize("name", OVERLAPPING)
+def test_overlapping_bodies_are_one_in_the_lattice(name, tmp_path, solid_peaks, caplog):
     with caplog.at_level(logging.WARNING, "tkamb"):
-        insert = read(tmp_path, PRESENT[name])
+        insert = read(tmp_path, OVERLAPPING[name])
     assert "does not count" in caplog.text
-    assert peak(insert, "lattice-linear") == pytest.approx(right["lattice-linear"], rel=1e-3)
+    assert peak(insert, "lattice-linear") == pytest.approx(solid_peaks["lattice-linear"], rel=1e-3)
 
 
 def test_a_block_on_a_part_of_a_plate_is_joined_to_it(tmp_path):
@@ -116,17 +116,17 @@ def test_a_void_contains_no_material(size, tmp_path):
     insert = read(tmp_path, [SOLID, void])
     lattice = whole_lattice(insert, size)
     middle = lattice.nodes[lattice.cells].mean(axis=1)
-    within = np.abs(middle - [0.0, 0.0045, 0.0]) < np.array([0.012, 0.0025, 0.02]) - 1e-4
-    assert not within.all(axis=1).any()
+    inner = np.abs(middle - [0.0, 0.0045, 0.0]) < np.array([0.012, 0.0025, 0.02]) - 1e-4
+    assert not inner.all(axis=1).any()
     assert cell_volumes(lattice.nodes[lattice.cells]).sum() == pytest.approx(
         SOLID.volume - 0.024 * 0.005 * 0.04, rel=0.02
     )
 
 
 def test_a_body_within_another_one_is_refused(tmp_path):
-    within = block((-0.01, 0.01), (0.002, 0.006), (-0.01, 0.01))
+    inner = block((-0.01, 0.01), (0.002, 0.006), (-0.01, 0.01))
     with pytest.raises(InputError, match="2 separate bodies"):
-        read(tmp_path, [SOLID, within])
+        read(tmp_path, [SOLID, inner])
 
 
 def test_bodies_a_tenth_of_a_millimetre_apart_are_separate(tmp_path):

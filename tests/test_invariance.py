@@ -87,7 +87,7 @@ def test_turning_the_laboratory_about_the_vertical_changes_nothing(angle_deg):
         np.testing.assert_allclose(numbers(mechanics.frame(k)), expected, atol=1e-10 * scale)
 
 
-def test_turning_it_anyhow_changes_nothing_if_gravity_is_turned_too():
+def test_any_rotation_of_laboratory_and_gravity_changes_nothing():
     rotation = Rotation.from_euler("xyz", [40.0, 100.0, -75.0], degrees=True).as_matrix()
     case = turned(shipped.__wrapped__(), rotation, np.zeros(3))
     gravity = rotation @ case.chain.model.gravity.linear
@@ -101,7 +101,6 @@ def test_turning_it_anyhow_changes_nothing_if_gravity_is_turned_too():
 
 @pytest.mark.parametrize("axes", ["+y,+z,+x", "-x,+y,-z"])
 def test_a_laboratory_with_other_axes_gives_the_same(tmp_path, axes):
-    """The same measurements are in files with other `laboratory_axes`."""
     to_laboratory = np.zeros((3, 3))
     for row, axis in enumerate(axes.split(",")):
         to_laboratory[row, "xyz".index(axis[1])] = -1.0 if axis[0] == "-" else 1.0
@@ -144,7 +143,7 @@ def _turn_columns(path, to_laboratory):
 
 
 LENGTH, MASS, TIME = 2.0, 4.0, 0.5
-"""Of the new unit system, in old units: powers of two, so that floats scale exactly."""
+"""Units of the new system, in old units: powers of two, so that floats scale exactly."""
 FORCE = MASS * LENGTH / TIME**2
 
 
@@ -198,9 +197,9 @@ def scaled_chain(case: Case) -> Chain:
 
 
 def scaled_pose(poses):
-    moved = np.array(poses)
-    moved[..., :3, 3] *= LENGTH
-    return moved
+    scaled = np.array(poses)
+    scaled[..., :3, 3] *= LENGTH
+    return scaled
 
 
 def scaled_case(case: Case) -> Case:
@@ -247,8 +246,8 @@ def scaled_case(case: Case) -> Case:
 
 
 def test_other_units_give_the_dimensionally_scaled_answer(monkeypatch):
-    """Lengths, masses and times scaled, gravity and the model's own lengths along."""
-    unscaled = shipped_loads()  # with the model's own lengths as they are
+    """Lengths, masses, times and gravity of the case are scaled, and lengths in the settings."""
+    unscaled = shipped_loads()  # before the settings are scaled
     speed = contact_points.CONTACT_POINT.standstill_speed * LENGTH / TIME
     contact_point = replace(contact_points.CONTACT_POINT, standstill_speed=speed)
     monkeypatch.setattr(contact_points, "CONTACT_POINT", contact_point)
@@ -289,7 +288,7 @@ def test_other_units_give_the_dimensionally_scaled_answer(monkeypatch):
 
 
 def resampled_scene(folder, rate, cutoff, start=1.0, stop=2.0):
-    """Write the shipped bend as recorded at another rate (Hz), over a part of it."""
+    """Write a part of the shipped bend (`start` to `stop`, s), resampled at a rate (Hz)."""
     changes = {f"{table}__cutoff_Hz": cutoff for table in ("motion", "ground_reaction")}
     path = write_scene(folder, **changes)
     time = np.linspace(start, stop, round((stop - start) * rate) + 1)
@@ -310,12 +309,12 @@ def resampled_scene(folder, rate, cutoff, start=1.0, stop=2.0):
 
 def test_slow_and_fast_recordings_of_the_same_motion_agree(tmp_path):
     """One second of the bend at 20 Hz and 1000 Hz, both filtered at 6 Hz, agrees to 1e-4 BW."""
-    found = {}
+    forces = {}
     for rate in (20, 1000):
         case = load_case(load_scene(resampled_scene(tmp_path / str(rate), rate, 6.0)))
         mechanics = mechanics_of(case)
         chosen = [int(np.argmin(np.abs(case.motion.time - at))) for at in (1.3, 1.5, 1.7)]
         frames = [mechanics.frame(k) for k in chosen]
         assert not any(frame.loads.problems for frame in frames)
-        found[rate] = np.array([frame.loads.contact_force for frame in frames])
-    assert np.abs(found[20] - found[1000]).max() < 1e-4 * shipped().body_weight
+        forces[rate] = np.array([frame.loads.contact_force for frame in frames])
+    assert np.abs(forces[20] - forces[1000]).max() < 1e-4 * shipped().body_weight

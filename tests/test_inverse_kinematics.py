@@ -17,7 +17,7 @@ INSERT = pose(Rotation.from_euler("xyz", [0.03, -0.02, 0.05]).as_matrix(), [0.01
 def segments(seed: int = 0) -> list[Segment]:
     rng = np.random.default_rng(seed)
 
-    def own(name: str, middle: list[float], count: int, **joint) -> Segment:
+    def segment(name: str, middle: list[float], count: int, **joint) -> Segment:
         points = np.array(middle) + rng.normal(0.0, 0.06, (count, 3))
         weights = rng.uniform(0.5, 2.0, count)
         labels = tuple(f"{name}{k}" for k in range(count))
@@ -30,10 +30,10 @@ def segments(seed: int = 0) -> list[Segment]:
         "centre": np.array([-0.04, -0.1, 0.08]),
     }
     return [
-        own("shank", [0.0, 0.2, 0.0], 3),
-        own("thigh", [0.03, 0.2, 0.05], 3),
-        own("foot", [0.1, 0.0, 0.0], 4, **ankle),
-        own("pelvis", [0.0, 0.0, 0.0], 4, **hip),
+        segment("shank", [0.0, 0.2, 0.0], 3),
+        segment("thigh", [0.03, 0.2, 0.05], 3),
+        segment("foot", [0.1, 0.0, 0.0], 4, **ankle),
+        segment("pelvis", [0.0, 0.0, 0.0], 4, **hip),
     ]
 
 
@@ -108,12 +108,12 @@ def test_the_solution_is_a_minimum_of_the_weighted_distance():
     weights = np.concatenate([s.weights for s in chain.segments.values()])
     fit = fit_chain(chain, measured, weights, start(chain, measured))
     places, jacobian = chain.markers(fit.state)
-    pull = np.einsum("fmi,m,fmin->fn", places - measured, weights, jacobian)
-    assert fit.solved.all() and np.abs(pull).max() < 1e-5
+    gradient = np.einsum("fmi,m,fmin->fn", places - measured, weights, jacobian)
+    assert fit.solved.all() and np.abs(gradient).max() < 1e-5
     heavier = weights.copy()
     heavier[4] *= 1e6
-    close = fit_chain(chain, measured, heavier, start(chain, measured))
-    assert close.distance[:, 4].max() < 0.01 * fit.distance[:, 4].min()
+    refit = fit_chain(chain, measured, heavier, start(chain, measured))
+    assert refit.distance[:, 4].max() < 0.01 * fit.distance[:, 4].min()
 
 
 def test_flexion_has_no_bound():
@@ -139,7 +139,7 @@ def test_a_rigid_fit_needs_three_visible_markers():
         poses[:2], np.tile(pose(turn, [1.0, 2.0, 3.0]), (2, 1, 1)), atol=1e-12
     )
     assert np.isnan(poses[2]).all() and np.isnan(rms[2])
-    whole, _ = fit_rigid(markers[:1], reference)
-    np.testing.assert_allclose(poses[:1], whole, atol=1e-14)
+    rigid, _ = fit_rigid(markers[:1], reference)
+    np.testing.assert_allclose(poses[:1], rigid, atol=1e-14)
     with pytest.raises(InputError, match="no orientation"):
         fit_seen(markers[:, :2], reference[:2], np.ones(2), "x")

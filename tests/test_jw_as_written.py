@@ -18,13 +18,13 @@ pytestmark = pytest.mark.skipif(
     not JW.is_dir(), reason="subject JW's files are not beside the project"
 )
 INTO = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-"""From the file's axes, z up, to a table's, y up."""
+"""Rotation from the file's axes, z up, to a table's axes, y up."""
 
 
 def imported(folder, *options):
     """Import JW's leg without implant, and return the case."""
-    given = ["--side", "right", "--mass-kg", "66.7", "--out", str(folder)]
-    assert main(["import", str(JW / "JW.osim"), *map(str, options), *given]) == 0
+    arguments = ["--side", "right", "--mass-kg", "66.7", "--out", str(folder)]
+    assert main(["import", str(JW / "JW.osim"), *map(str, options), *arguments]) == 0
     return load_case(load_scene(folder / "scene.toml"))
 
 
@@ -38,100 +38,102 @@ def assert_same(case, reference, N=1e-3, Nm=1e-3):
     np.testing.assert_allclose(case.motion.coordinates, reference.motion.coordinates, atol=1e-5)
     np.testing.assert_allclose(case.ground.force, reference.ground.force, atol=N)
     about = [
-        one.ground.moment + np.cross(one.ground.point, one.ground.force)
-        for one in (case, reference)
+        each.ground.moment + np.cross(each.ground.point, each.ground.force)
+        for each in (case, reference)
     ]
     np.testing.assert_allclose(*about, atol=Nm)
 
 
-def units_of_one_maker(whole):
+def units_of_one_maker(content):
     units = ["nt", "nt", "nt", "ntmm", "ntmm", "ntmm"] * 3
-    whole["parameters"]["ANALOG"]["UNITS"]["value"][:18] = units
+    content["parameters"]["ANALOG"]["UNITS"]["value"][:18] = units
 
 
-def equal_labels_of_the_arms(whole):
-    labels = whole["parameters"]["POINT"]["LABELS"]["value"]
+def equal_labels_of_the_arms(content):
+    labels = content["parameters"]["POINT"]["LABELS"]["value"]
     labels[labels.index("RWrist")] = "RElbow"
 
 
-def equal_channels(whole):
-    labels = whole["parameters"]["ANALOG"]["LABELS"]["value"]
+def equal_channels(content):
+    labels = content["parameters"]["ANALOG"]["LABELS"]["value"]
     labels[20] = labels[19]
 
 
-def metres_and_volts(whole):
-    """Type 4 in a file in metres: the matrix gives N and N·m."""
-    whole["parameters"]["POINT"]["UNITS"]["value"] = ["m"]
-    whole["data"]["points"][:3] *= 1e-3
-    plates, analog = whole["parameters"]["FORCE_PLATFORM"], whole["parameters"]["ANALOG"]
+def metres_and_volts(content):
+    """Write plates of type 4 in metres and volts, with a calibration matrix to N and N·m."""
+    content["parameters"]["POINT"]["UNITS"]["value"] = ["m"]
+    content["data"]["points"][:3] *= 1e-3
+    plates, analog = content["parameters"]["FORCE_PLATFORM"], content["parameters"]["ANALOG"]
     for key in ("CORNERS", "ORIGIN"):
         plates[key]["value"] = np.asarray(plates[key]["value"]) * 1e-3
-    whole["data"]["analogs"][0, :18] /= np.tile([[100.0]] * 3 + [[1e5]] * 3, (3, 1))
+    content["data"]["analogs"][0, :18] /= np.tile([[100.0]] * 3 + [[1e5]] * 3, (3, 1))
     analog["UNITS"]["value"][:18] = ["V"] * 18
     plates["TYPE"]["value"] = [4, 4, 4]
     matrices = np.repeat(100.0 * np.eye(6)[:, :, None], 3, axis=2)
-    whole.add_parameter("FORCE_PLATFORM", "CAL_MATRIX", matrices)
+    content.add_parameter("FORCE_PLATFORM", "CAL_MATRIX", matrices)
 
 
-def a_plate_that_nobody_reads(whole):
-    """A fourth plate of a type that is not read, far from the walkway."""
-    plates = whole["parameters"]["FORCE_PLATFORM"]
+def a_plate_of_unknown_type(content):
+    """Add a fourth plate of a type that is not read, far from the walkway."""
+    plates = content["parameters"]["FORCE_PLATFORM"]
     plates["USED"]["value"], plates["TYPE"]["value"] = [4], [2, 2, 2, 21]
     for key in ("CORNERS", "ORIGIN", "CHANNEL"):
         value = np.asarray(plates[key]["value"])
         plates[key]["value"] = np.concatenate([value, value[..., -1:]], axis=-1)
 
 
-WRITTEN = [
+CHANGES = [
     units_of_one_maker,
     equal_labels_of_the_arms,
     equal_channels,
     metres_and_volts,
-    a_plate_that_nobody_reads,
+    a_plate_of_unknown_type,
 ]
 
 
-@pytest.mark.parametrize("change", WRITTEN)
+@pytest.mark.parametrize("change", CHANGES)
 def test_the_same_trial_in_another_form_gives_the_same_case(tmp_path, reference, change):
-    whole = ezc3d.c3d(str(TRIAL))
-    change(whole)
-    whole.write(str(tmp_path / "og3.c3d"))
+    content = ezc3d.c3d(str(TRIAL))
+    change(content)
+    content.write(str(tmp_path / "og3.c3d"))
     assert_same(imported(tmp_path / "out", "--c3d", tmp_path / "og3.c3d"), reference)
 
 
-def drift_without_a_baseline(whole):
-    whole["data"]["analogs"][0, [2, 8, 14]] -= 5.0
+def drift_without_a_baseline(content):
+    content["data"]["analogs"][0, [2, 8, 14]] -= 5.0
 
 
-def drift_with_a_baseline(whole):
-    drift_without_a_baseline(whole)
-    whole["parameters"]["FORCE_PLATFORM"]["ZERO"]["value"] = [1, 20]
+def drift_with_a_baseline(content):
+    drift_without_a_baseline(content)
+    content["parameters"]["FORCE_PLATFORM"]["ZERO"]["value"] = [1, 20]
 
 
-def test_a_drift_is_taken_off_where_the_file_says_when_nobody_stood_there(tmp_path, reference):
-    whole = ezc3d.c3d(str(TRIAL))
-    drift_with_a_baseline(whole)
-    whole.write(str(tmp_path / "og3.c3d"))
+def test_a_drift_is_subtracted_if_the_file_states_unloaded_frames(tmp_path, reference):
+    content = ezc3d.c3d(str(TRIAL))
+    drift_with_a_baseline(content)
+    content.write(str(tmp_path / "og3.c3d"))
     assert_same(imported(tmp_path / "out", "--c3d", tmp_path / "og3.c3d"), reference, Nm=2e-3)
 
 
-def test_a_drift_is_told_and_only_acts_under_the_foot(tmp_path, reference, capsys):
-    whole = ezc3d.c3d(str(TRIAL))
-    drift_without_a_baseline(whole)
-    whole.write(str(tmp_path / "og3.c3d"))
+def test_a_drift_without_a_baseline_is_reported_and_stays_under_the_foot(
+    tmp_path, reference, capsys
+):
+    content = ezc3d.c3d(str(TRIAL))
+    drift_without_a_baseline(content)
+    content.write(str(tmp_path / "og3.c3d"))
     case = imported(tmp_path / "out", "--c3d", tmp_path / "og3.c3d")
     assert "force plate 2 reads 5.0 N while nobody stands on it" in capsys.readouterr().out
-    more = case.ground.force[:, 1] - reference.ground.force[:, 1]
-    assert more.max() < 5.5 and more.min() > -0.5
+    difference = case.ground.force[:, 1] - reference.ground.force[:, 1]
+    assert difference.max() < 5.5 and difference.min() > -0.5
     assert case.ground.drift == pytest.approx({2: 5.0, 3: 5.0}, abs=0.01)
 
 
-def test_a_standing_trial_needs_its_markers_alone(tmp_path):
+def test_a_standing_trial_needs_only_its_markers(tmp_path):
     standing = JW / "motion" / "jw_1legstand1.c3d"
-    whole = ezc3d.c3d(str(standing))
-    whole["data"]["analogs"][0, :, -51:] = np.nan
-    whole["parameters"]["FORCE_PLATFORM"]["TYPE"]["value"] = [2, 9, 2]
-    whole.write(str(tmp_path / "standing.c3d"))
+    content = ezc3d.c3d(str(standing))
+    content["data"]["analogs"][0, :, -51:] = np.nan
+    content["parameters"]["FORCE_PLATFORM"]["TYPE"]["value"] = [2, 9, 2]
+    content.write(str(tmp_path / "standing.c3d"))
     scenes = []
     for name, static in (("a", standing), ("b", tmp_path / "standing.c3d")):
         imported(tmp_path / name, "--c3d", TRIAL, "--static", static)
@@ -145,9 +147,9 @@ def test_markers_and_a_table_of_three_plates_give_the_case_of_the_c3d(tmp_path, 
     for plate in recording.plates:
         force, about = plate.force @ INTO.T, plate.wrench[:, 3:] @ INTO.T
         point = np.zeros_like(force)
-        on = force[:, 1] > 20
-        point[on, 0] = about[on, 2] / force[on, 1]  # the plates lie at height 0
-        point[on, 2] = -about[on, 0] / force[on, 1]
+        loaded = force[:, 1] > 20
+        point[loaded, 0] = about[loaded, 2] / force[loaded, 1]  # The plates are at height 0.
+        point[loaded, 2] = -about[loaded, 0] / force[loaded, 1]
         moment = about - np.cross(point, force)
         for kind, values in (("force_{}_v", force), ("force_{}_p", point), ("moment_{}_m", moment)):
             for k, axis in enumerate("xyz"):
@@ -155,24 +157,29 @@ def test_markers_and_a_table_of_three_plates_give_the_case_of_the_c3d(tmp_path, 
     write_storage(tmp_path / "g.mot", columns, in_degrees=False)
     points = {label: recording.points[:, k] @ INTO.T for k, label in enumerate(recording.labels)}
     write_trc(tmp_path / "og3.trc", recording.time, points, recording.rate_Hz)
-    given = ("--trc", tmp_path / "og3.trc", "--grf", tmp_path / "g.mot")
-    assert_same(imported(tmp_path / "found", *given), reference, N=0.05, Nm=0.15)
-    beside = ("--c3d", TRIAL, "--grf", tmp_path / "g.mot")  # z points up there, y in the table
-    assert_same(imported(tmp_path / "beside", *beside), reference, N=0.05, Nm=0.15)
+    arguments = ("--trc", tmp_path / "og3.trc", "--grf", tmp_path / "g.mot")
+    assert_same(imported(tmp_path / "found", *arguments), reference, N=0.05, Nm=0.15)
+    options_c3d = (
+        "--c3d",
+        TRIAL,
+        "--grf",
+        tmp_path / "g.mot",
+    )  # z is up in the C3D, y in the table
+    assert_same(imported(tmp_path / "beside", *options_c3d), reference, N=0.05, Nm=0.15)
     named = ("--grf-force", "ground_force_2,ground_force_3", "--interval", "2.075:3.9333334")
-    assert_same(imported(tmp_path / "named", *given, *named), reference, N=0.05, Nm=0.15)
+    assert_same(imported(tmp_path / "named", *arguments, *named), reference, N=0.05, Nm=0.15)
 
 
 def test_emg_of_a_recording_without_markers_is_read(tmp_path):
-    whole, alone = ezc3d.c3d(str(TRIAL)), ezc3d.c3d()
-    labels = whole["parameters"]["ANALOG"]["LABELS"]["value"][18:34]
-    alone["parameters"]["POINT"]["RATE"]["value"] = [120.0]
-    alone["parameters"]["ANALOG"]["RATE"]["value"] = [1200.0]
-    alone["parameters"]["ANALOG"]["LABELS"]["value"] = labels
-    alone["parameters"]["ANALOG"]["UNITS"]["value"] = ["V"] * 16
-    alone["data"]["points"] = np.zeros((4, 0, 291))
-    alone["data"]["analogs"] = whole["data"]["analogs"][:, 18:34]
-    alone.write(str(tmp_path / "emg.c3d"))
+    content, emg_file = ezc3d.c3d(str(TRIAL)), ezc3d.c3d()
+    labels = content["parameters"]["ANALOG"]["LABELS"]["value"][18:34]
+    emg_file["parameters"]["POINT"]["RATE"]["value"] = [120.0]
+    emg_file["parameters"]["ANALOG"]["RATE"]["value"] = [1200.0]
+    emg_file["parameters"]["ANALOG"]["LABELS"]["value"] = labels
+    emg_file["parameters"]["ANALOG"]["UNITS"]["value"] = ["V"] * 16
+    emg_file["data"]["points"] = np.zeros((4, 0, 291))
+    emg_file["data"]["analogs"] = content["data"]["analogs"][:, 18:34]
+    emg_file.write(str(tmp_path / "emg.c3d"))
     recording = read_c3d(tmp_path / "emg.c3d")
     np.testing.assert_allclose(
         recording.channel("vasmed"), read_c3d(TRIAL).channel("vasmed"), rtol=1e-6

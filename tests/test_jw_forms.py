@@ -77,7 +77,10 @@ def reference(tmp_path_factory) -> Path:
 FORMS = ("ampersand", "Latin-1", "ConstraintSet", "ForceSet", "MarkerSet", "every set", "massless")
 
 
-@pytest.mark.parametrize("name", FORMS)
+@pytest.mark.parametrize(
+    "name",
+    [*FORMS[:3], *(pytest.param(name, marks=pytest.mark.slow) for name in FORMS[3:])],
+)
 def test_another_form_gives_the_same_patient(tmp_path, reference, name):
     (tmp_path / "JW.osim").write_bytes(form(name, tmp_path))
     scene = imported(tmp_path / "JW.osim", tmp_path / "out")

@@ -108,28 +108,30 @@ def test_a_whole_body_has_the_same_knee_forces(read, left, leg_first):
     flip = MIRROR if left else np.eye(3)
     for k in (40, 80):
         state = body.state(*at(read, k))
-        here, there = body.knee.inverse_dynamics(*state), plain.inverse_dynamics(*at(read, k))
-        assert here.contact_force == pytest.approx(flip @ there.contact_force, abs=1e-9)
-        assert here.hip_force == pytest.approx(flip @ there.hip_force, abs=1e-9)
-        assert here.hip_moment == pytest.approx(-flip @ there.hip_moment * (1 if left else -1))
+        in_body, alone = body.knee.inverse_dynamics(*state), plain.inverse_dynamics(*at(read, k))
+        assert in_body.contact_force == pytest.approx(flip @ alone.contact_force, abs=1e-9)
+        assert in_body.hip_force == pytest.approx(flip @ alone.hip_force, abs=1e-9)
+        assert in_body.hip_moment == pytest.approx(-flip @ alone.hip_moment * (1 if left else -1))
         for name in ("quadriceps", "patellar_ligament", "patellofemoral", "external_adduction"):
-            assert getattr(here, name) == pytest.approx(getattr(there, name), abs=1e-9)
+            assert getattr(in_body, name) == pytest.approx(getattr(alone, name), abs=1e-9)
         signs = (
             {"ap": 1.0, "ml": -1.0, "axial": -1.0}
             if left
             else dict.fromkeys(("ap", "ml", "axial"), 1.0)
         )
-        for name, value in there.residuals.items():
-            assert here.residuals[name] == pytest.approx(signs[name] * value, abs=1e-9)
-        own, other = (
+        for name, value in alone.residuals.items():
+            assert in_body.residuals[name] == pytest.approx(signs[name] * value, abs=1e-9)
+        body_forces, plain_forces = (
             knee.external_forces(q, v, 800.0)
             for knee, (q, v) in ((body.knee, state[:2]), (plain, at(read, k)[:2]))
         )
         tibia = plain.anatomy.tibia
-        expected = tibia.placement.actInv(other[tibia.joint]).vector
+        expected = tibia.placement.actInv(plain_forces[tibia.joint]).vector
         expected = expected * (np.array([1, 1, -1, -1, -1, 1]) if left else 1.0)
         calf = body.knee.anatomy.tibia
-        assert calf.placement.actInv(own[calf.joint]).vector == pytest.approx(expected, abs=1e-8)
+        assert calf.placement.actInv(body_forces[calf.joint]).vector == pytest.approx(
+            expected, abs=1e-8
+        )
 
 
 def test_rnea_with_the_solved_loads_leaves_the_residuals(read):
@@ -138,22 +140,26 @@ def test_rnea_with_the_solved_loads_leaves_the_residuals(read):
         q, v, a, external = at(read, k)
         loads = knee.inverse_dynamics(q, v, a, external)
         data = knee.model.createData()
-        # the residuals act on the tibia, the opposite loads on the femur
+        # residuals act on the tibia, opposite loads on the femur
         jacobian, on_tibia = knee.relative_jacobian(q), residual_wrench(knee, loads)
         acting = plus(external, loads.external_forces, loads.hip_forces)
         tau = pin.rnea(knee.model, data, q, v, a, acting)
         assert np.abs(tau).max() > 1.0
         assert tau == pytest.approx(-jacobian.T @ on_tibia, abs=1e-8)
-        rest = plus(external, loads.external_forces, loads.residual_forces, loads.hip_forces)
-        assert pin.rnea(knee.model, data, q, v, a, rest) == pytest.approx(0.0, abs=1e-8)
+        with_residuals = plus(
+            external, loads.external_forces, loads.residual_forces, loads.hip_forces
+        )
+        assert pin.rnea(knee.model, data, q, v, a, with_residuals) == pytest.approx(0.0, abs=1e-8)
 
 
 def residual_wrench(knee, loads):
     """Return the wrench (6,) of the reported residuals on the tibia, about the insert's origin."""
-    found = loads.residuals
+    residuals = loads.residuals
     middle = np.mean([one.point for one in loads.geometry.condyles.values()], axis=0)
-    force = np.array([found["ap"], 0.0, found["ml"]])
-    moment = np.array([found.get("coronal", 0.0), found["axial"], found.get("flexion", 0.0)])
+    force = np.array([residuals["ap"], 0.0, residuals["ml"]])
+    moment = np.array(
+        [residuals.get("coronal", 0.0), residuals["axial"], residuals.get("flexion", 0.0)]
+    )
     return np.concatenate([force, moment + cross(middle, force)])
 
 
@@ -171,7 +177,7 @@ def test_forces_on_the_joints_are_internal(read):
     assert total == pytest.approx(0.0, abs=1e-9)
 
 
-def test_ligaments_pull_as_their_energy_falls(read):
+def test_the_pull_of_the_ligaments_is_the_slope_of_their_energy(read):
     """Without contact the generalised force is minus the slope of the bundles' energy."""
     plain, motion, _ = read
     toe = [replace(one, law="quadratic-toe", stiffness=2e3) for one in plain.ligaments]
@@ -217,9 +223,9 @@ def test_stiffness_is_the_slope_of_the_wrench(read, name):
     stiffness = knee.stiffness(q, v)
     contact = knee.contact
     probe = contact.precise_probe()
-    place = knee.pose(q).homogeneous
+    femur_pose = knee.pose(q).homogeneous
     twist = knee.relative_jacobian(q) @ v
-    contact.at(probe, place)
+    contact.at(probe, femur_pose)
     rng = np.random.default_rng(1)
     # curvatures of Hertz's ellipses jump from facet to facet
     size, share = (1e-9, 0.01) if contact.model.probe(contact.state).exact else (3e-6, 0.02)
@@ -228,13 +234,13 @@ def test_stiffness_is_the_slope_of_the_wrench(read, name):
         step = size * rng.standard_normal(6) / np.array([1.0, 1.0, 1.0, 0.03, 0.03, 0.03])
         ends = []
         for sign in (1.0, -1.0):
-            moved = displaced(place, sign * step)
+            moved = displaced(femur_pose, sign * step)
             wrench = contact.wrench(contact.at(probe, moved), twist)
             ends.append(wrench + knee._crossing.wrench(moved))
-        slope, found = (ends[0] - ends[1]) / 2.0, stiffness @ step
+        slope, predicted = (ends[0] - ends[1]) / 2.0, stiffness @ step
         scale = share * np.linalg.norm(slope[:3])
-        assert found[:3] == pytest.approx(slope[:3], abs=scale), name
-        assert found[3:] == pytest.approx(slope[3:], abs=0.03 * scale), name
+        assert predicted[:3] == pytest.approx(slope[:3], abs=scale), name
+        assert predicted[3:] == pytest.approx(slope[3:], abs=0.03 * scale), name
 
 
 def pressed(knee, q, load):
@@ -254,26 +260,26 @@ def test_a_left_knee_is_as_stiff_as_its_mirror_image(read):
     state = body.state(q, v, a, external)
     flip = np.diag([1.0, 1.0, -1.0, -1.0, -1.0, 1.0])
     expected = flip @ plain.stiffness(q, v, exact=False) @ flip
-    found = body.knee.stiffness(*state[:2], exact=False)
-    assert found == pytest.approx(expected, rel=1e-6, abs=1e-3 * np.abs(expected).max())
+    stiffness = body.knee.stiffness(*state[:2], exact=False)
+    assert stiffness == pytest.approx(expected, rel=1e-6, abs=1e-3 * np.abs(expected).max())
 
 
-def test_equilibrium_leaves_no_force_and_its_contact_carries_the_loads(read):
+def test_in_equilibrium_the_residual_is_small_and_the_contact_carries_the_loads(read):
     knee, motion, _ = read
     k = 75
-    found = knee.equilibrium(*at(read, k))
-    assert not found.problem
-    assert found.residual < 0.06
-    assert knee.coordinates(found.q) == pytest.approx(found.coordinates, abs=1e-11)
-    by_deformation = -found.contact.wrench_on_insert[:3]
-    frictionless = found.loads.contact_force[1]
+    equilibrium = knee.equilibrium(*at(read, k))
+    assert not equilibrium.problem
+    assert equilibrium.residual < 0.06
+    assert knee.coordinates(equilibrium.q) == pytest.approx(equilibrium.coordinates, abs=1e-11)
+    by_deformation = -equilibrium.contact.wrench_on_insert[:3]
+    frictionless = equilibrium.loads.contact_force[1]
     assert by_deformation[1] == pytest.approx(frictionless, rel=2e-3)
     # the deformation at that pose gives the contact forces of the equations
-    forces = knee.external_forces(found.q, motion.v[k], found.loads.tensions)
+    forces = knee.external_forces(equilibrium.q, motion.v[k], equilibrium.loads.tensions)
     weight = 1.0  # N: weight of the patella, which these forces ignore
-    for place, apart in ((knee.anatomy.tibia, 0.1), (knee.anatomy.femur, 0.1 + weight)):
-        asked = found.loads.external_forces[place.joint].vector
-        assert forces[place.joint].vector == pytest.approx(asked, abs=apart)
+    for fixed_frame, tolerance in ((knee.anatomy.tibia, 0.1), (knee.anatomy.femur, 0.1 + weight)):
+        expected = equilibrium.loads.external_forces[fixed_frame.joint].vector
+        assert forces[fixed_frame.joint].vector == pytest.approx(expected, abs=tolerance)
 
 
 def test_files_and_object_find_the_same_equilibrium():
@@ -282,22 +288,22 @@ def test_files_and_object_find_the_same_equilibrium():
     scene = tkamb.load_scene(SCENE, FOUNDATION | {"contact.released": free})
     read = tkamb.read_scene(scene)
     results = tkamb.simulate(scene, frames=slice(60, 61))
-    found = read[0].equilibrium(*at(read, 60), released=free)
-    for name, value in columns(found.loads).items():
+    equilibrium = read[0].equilibrium(*at(read, 60), released=free)
+    for name, value in columns(equilibrium.loads).items():
         assert value == pytest.approx(results[name][0], rel=1e-9, abs=1e-9), name
     for k, axis in enumerate(("ap", "si", "ml")):
-        assert 1e3 * found.coordinates[k] == pytest.approx(results[f"{axis}_mm"][0], abs=1e-9)
+        assert 1e3 * equilibrium.coordinates[k] == pytest.approx(results[f"{axis}_mm"][0], abs=1e-9)
     peak = 1e6 * results["medial_peak_pressure_MPa"][0]
-    assert found.contact.medial.peak_pressure == pytest.approx(peak, rel=1e-9)
+    assert equilibrium.contact.medial.peak_pressure == pytest.approx(peak, rel=1e-9)
 
 
 def test_equilibrium_in_a_whole_body_is_the_same(read):
     plain = read[0]
     body = whole_body(plain)
-    here = body.knee.equilibrium(*body.state(*at(read, 60)), released=("ap", "adduction"))
-    there = plain.equilibrium(*at(read, 60), released=("ap", "adduction"))
-    assert here.coordinates == pytest.approx(there.coordinates, abs=1e-7)
-    assert here.loads.contact_total == pytest.approx(there.loads.contact_total, abs=0.1)
+    in_body = body.knee.equilibrium(*body.state(*at(read, 60)), released=("ap", "adduction"))
+    alone = plain.equilibrium(*at(read, 60), released=("ap", "adduction"))
+    assert in_body.coordinates == pytest.approx(alone.coordinates, abs=1e-7)
+    assert in_body.loads.contact_total == pytest.approx(alone.loads.contact_total, abs=0.1)
 
 
 def test_warm_and_cold_calls_agree_and_leave_no_trace(read):
@@ -307,14 +313,14 @@ def test_warm_and_cold_calls_agree_and_leave_no_trace(read):
     data = knee.create_data()
     for k in (58, 59, 61):
         knee.external_forces(motion.q[k], motion.v[k], data=data)
-    warm, again = knee.external_forces(q, v, data=data), knee.external_forces(q, v)
+    warm, cold_again = knee.external_forces(q, v, data=data), knee.external_forces(q, v)
     for joint in range(1, knee.model.njoints):
-        assert np.array_equal(again[joint].vector, cold[joint].vector)
+        assert np.array_equal(cold_again[joint].vector, cold[joint].vector)
         assert warm[joint].vector == pytest.approx(cold[joint].vector, abs=1e-9)
 
 
 def test_an_insert_anywhere_on_the_tibia_gives_the_same_forces(read):
-    """The flat bottom of an insert mesh in the tibia's axes is found."""
+    """`Knee` finds the flat bottom of an insert mesh in the tibia's axes."""
     plain, motion, _ = read
     in_tibia = inverse(plain.anatomy.tibia.placement.homogeneous) @ (
         plain.bridge.insert.placement.homogeneous
@@ -334,7 +340,7 @@ def test_an_insert_anywhere_on_the_tibia_gives_the_same_forces(read):
     assert knee.external_forces(q, v)[1].vector == pytest.approx(expected, abs=1e-5)
 
 
-def test_given_muscles_pull_from_frame_to_frame(read):
+def test_muscles_of_given_tension_pull_between_frames(read):
     plain = read[0]
     points = (("femur", (-0.02, 0.2, 0.0)), ("tibia", (-0.03, 0.30, 0.01)))
     flexor = tkamb.Muscle("hamstrings", points)
@@ -401,7 +407,7 @@ def test_inconsistent_arguments_are_refused_in_one_line(read):
         (lambda: knee_of(read, joints=["root_joint"]), "not part of the knee"),
         (lambda: knee_of(read, implant=tkamb.Implant(plain.femoral)), "no insert mesh"),
         (lambda: knee_of(read, implant=tkamb.Implant(mesh, plain.insert)), "metres"),
-        (lambda: knee_of(read, implant=tkamb.Implant("femur.stl", plain.insert)), "no mesh"),
+        (lambda: knee_of(read, implant=tkamb.Implant("femur.stl", plain.insert)), "not a mesh"),
         (lambda: knee_of(read, ligaments=[bundle]), "slack length"),
         (lambda: knee_of(read, ligaments=[lost]), "universe"),
         (lambda: knee_of(read, friction=-0.1), "friction"),

@@ -43,21 +43,22 @@ def drop(plain, step, seconds):
     touch = knee.contact.pair.first_touch_height(knee.pose(np.zeros(1)).homogeneous)
     depth = np.linspace(0.0, 6e-4, 1201)
     force = [knee.evaluate(np.array([touch - d])).wrench_on_insert[1] for d in depth]
-    stored = -np.cumsum(np.concatenate([[0.0], (np.array(force)[1:] + force[:-1]) / 2.0]))
-    stored *= depth[1]
+    strain_energy = -np.cumsum(np.concatenate([[0.0], (np.array(force)[1:] + force[:-1]) / 2.0]))
+    strain_energy *= depth[1]
     q, v, data = np.array([touch + HEIGHT]), np.zeros(1), knee.create_data()
-    found = []
+    energies = []
     for _ in range(round(seconds / step)):
         q, v = implicit_step(knee, q, v, step, data=data)
-        above = q[0] - touch
-        found.append(
-            MASS * (0.5 * v[0] ** 2 + 9.81 * above) + np.interp(-above, depth, stored, left=0.0)
+        height = q[0] - touch
+        energies.append(
+            MASS * (0.5 * v[0] ** 2 + 9.81 * height)
+            + np.interp(-height, depth, strain_energy, left=0.0)
         )
-    return np.array(found) / (MASS * 9.81 * HEIGHT)
+    return np.array(energies) / (MASS * 9.81 * HEIGHT)
 
 
 def test_a_dropped_femur_keeps_its_energy_to_the_order_of_the_scheme(plain):
-    """Half of the step gives about a quarter of the error, and slightly more at kinks."""
+    """With half of the step the error is about a quarter, and slightly larger at kinks."""
     coarse, fine = (np.abs(drop(plain[0], h, 0.1) - 1.0).max() for h in (1e-3, 5e-4))
     assert coarse < 0.15
     assert fine < coarse / 3.0
@@ -74,7 +75,7 @@ def test_a_simulator_converges_to_the_equilibrium(plain):
     read, motion, _ = plain
     bundles = [b for b in read.ligaments if {b.proximal.link, b.distal.link} == {"femur", "tibia"}]
     shift = read.anatomy.tibia.placement.inverse() * read.bridge.insert.placement
-    place = read.coordinates(motion.q[30])
+    initial_coordinates = read.coordinates(motion.q[30])
     joints = {
         "ap": pin.JointModelPX(),
         "si": pin.JointModelPY(),
@@ -83,7 +84,7 @@ def test_a_simulator_converges_to_the_equilibrium(plain):
         "tilt": pin.JointModelRevoluteUnaligned(np.array([-1.0, 0.0, 0.0])),
     }
     at_insert = [shifted(bundle, shift) for bundle in bundles]
-    knee = on_fixed_insert(read, joints, place, 4.0, ligaments=at_insert)
+    knee = on_fixed_insert(read, joints, initial_coordinates, 4.0, ligaments=at_insert)
     model = knee.model
     model.gravity = pin.Motion.Zero()
     load = pin.Force(np.array([0.0, -800.0, 0.0]), np.array([0.0, 0.0, 800.0 * 4e-3]))
@@ -103,12 +104,12 @@ def test_a_simulator_converges_to_the_equilibrium(plain):
             knee, q, v, 0.02, external=external(q), theta=1.0, friction_of_joints=drag, data=data
         )
     assert np.abs(v).max() < 1e-6
-    found = knee.equilibrium(q + 1e-4, 0 * v, 0 * v, external(q + 1e-4))
-    assert not found.problem
-    settled = knee.coordinates(q)
-    assert settled[:3] == pytest.approx(found.coordinates[:3], abs=2e-5)
-    assert settled[3:] == pytest.approx(found.coordinates[3:], abs=2e-4)
-    assert found.loads.contact_force[1] > 800.0
+    equilibrium = knee.equilibrium(q + 1e-4, 0 * v, 0 * v, external(q + 1e-4))
+    assert not equilibrium.problem
+    coordinates = knee.coordinates(q)
+    assert coordinates[:3] == pytest.approx(equilibrium.coordinates[:3], abs=2e-5)
+    assert coordinates[3:] == pytest.approx(equilibrium.coordinates[3:], abs=2e-4)
+    assert equilibrium.loads.contact_force[1] > 800.0
     # the simulator's forces balance all loads except the prescribed load
     forces = knee.external_forces(q, 0 * v)
     tau = pin.rnea(model, model.createData(), q, v, 0 * v, forces)
@@ -132,14 +133,14 @@ def test_a_linear_step_agrees_with_a_full_step_to_second_order(plain):
     parts = {"implant": read.implant, "contact": read.contact.model, "friction": 0.05}
     knee = tkamb.Knee(read.model, ligaments=read.ligaments, **parts)
     q, v, _, external = at(plain, 60)
-    q, apart = pressed(read, q, 1000.0), []
+    q, differences = pressed(read, q, 1000.0), []
     for step in (2e-4, 1e-4):
         ends = [
             implicit_step(knee, q, v, step, external=external, theta=1.0, linear=linear)[1]
             for linear in (False, True)
         ]
-        apart.append(float(np.abs(ends[0] - ends[1]).max()))
-    assert apart[1] < 0.4 * apart[0]
+        differences.append(float(np.abs(ends[0] - ends[1]).max()))
+    assert differences[1] < 0.4 * differences[0]
 
 
 def test_friction_only_dissipates(plain):
@@ -169,10 +170,10 @@ def test_damping_is_the_slope_of_the_friction(plain):
     ends = [rough.external_forces(q, v + sign * step)[tibia] for sign in (1.0, -1.0)]
     insert = rough.bridge.insert.placement
     slope = insert.actInv(ends[0] - ends[1]).vector / 2.0
-    found = rough.damping(q, v) @ jacobian @ step
-    assert found == pytest.approx(slope, rel=1e-4, abs=1e-7)
-    assert np.linalg.norm(found) > 1e-6
-    assert found @ jacobian @ step > 0.0  # on the insert with the femur, on the femur against it
+    change = rough.damping(q, v) @ jacobian @ step
+    assert change == pytest.approx(slope, rel=1e-4, abs=1e-7)
+    assert np.linalg.norm(change) > 1e-6
+    assert change @ jacobian @ step > 0.0  # friction on the insert follows the femur
 
 
 def test_a_step_that_is_too_long_is_refused(plain):

@@ -81,17 +81,17 @@ def test_a_model_without_a_patella_has_one_in_equilibrium(read):
     assert loads.quadriceps == pytest.approx(recorded.quadriceps, rel=0.01)
     assert loads.contact_total == pytest.approx(recorded.contact_total, rel=0.01)
     assert abs(loads.patellofemoral_tangential) < 1e-3 * loads.patellofemoral
-    rest = [
+    all_forces = [
         sum((part[j] for part in parts), pin.Force.Zero())
         for j in range(3)
         for parts in [(external, loads.external_forces, loads.residual_forces, loads.hip_forces)]
     ]
-    tau = pin.rnea(knee.model, knee.model.createData(), q, v, a, pin.StdVec_Force(rest))
+    tau = pin.rnea(knee.model, knee.model.createData(), q, v, a, pin.StdVec_Force(all_forces))
     assert tau == pytest.approx(0.0, abs=1e-8)
 
 
 def test_a_given_tension_has_the_forces_of_the_solved_loads(read):
-    """With the massless patella's ratios a given tension has the forces of the solved loads."""
+    """The quadriceps' tension alone gives the same forces as both tensions of the solution."""
     knee = without_patella(read[0])
     q, v, a, external = state_of(read, 60)
     loads = knee.inverse_dynamics(q, v, a, external)
@@ -102,15 +102,15 @@ def test_a_given_tension_has_the_forces_of_the_solved_loads(read):
         assert by_both[joint].vector == pytest.approx(by_ratio[joint].vector, rel=1e-5, abs=1e-3)
 
 
-def test_equilibrium_moves_the_knee_of_such_a_model(read):
+def test_equilibrium_moves_the_knee_of_a_model_without_a_patella(read):
     knee = without_patella(read[0])
     q, v, a, external = state_of(read, 60)
-    found = knee.equilibrium(q, v, a, external)
-    assert not found.problem
-    assert knee.coordinates(found.q) == pytest.approx(found.coordinates, abs=1e-10)
-    assert found.q[:7] == pytest.approx(q[:7])
-    again = knee.external_forces(found.q, v, found.loads.tensions)
-    assert again[1].vector == pytest.approx(found.loads.external_forces[1].vector, abs=0.15)
+    equilibrium = knee.equilibrium(q, v, a, external)
+    assert not equilibrium.problem
+    assert knee.coordinates(equilibrium.q) == pytest.approx(equilibrium.coordinates, abs=1e-10)
+    assert equilibrium.q[:7] == pytest.approx(q[:7])
+    forces = knee.external_forces(equilibrium.q, v, equilibrium.loads.tensions)
+    assert forces[1].vector == pytest.approx(equilibrium.loads.external_forces[1].vector, abs=0.15)
 
 
 @pytest.mark.parametrize("left", [False, True])

@@ -1,4 +1,4 @@
-"""The lines across the knee of subject JW: the same wrench as the model's paths, and the rows."""
+"""Muscle lines across the knee have the wrench of the model's paths. Their sharing is optimal."""
 
 import numpy as np
 import pytest
@@ -23,14 +23,14 @@ CROSSING = {"bflh", "bfsh", "gaslat", "gasmed", "grac", "sart", "semimem", "semi
 
 @pytest.fixture(scope="module")
 def jw():
-    """Return links, every 40th frame of og3 as a trial, and what acts on the bones."""
+    """Return links, every 40th frame of og3 as a trial, and the muscles' forces on the bones."""
     trial = gait(1.9, 4.2)
-    some = slice(None, None, 40)
+    stride = slice(None, None, 40)
     motion = trial.motion
     motion = CoordinateMotion(
-        motion.time[some], motion.q[some], motion.rates[some], motion.accelerations[some]
+        motion.time[stride], motion.q[stride], motion.rates[stride], motion.accelerations[stride]
     )
-    loads = {body: wrench[some] for body, wrench in trial.loads.items()}
+    loads = {body: wrench[stride] for body, wrench in trial.loads.items()}
     leg = find_leg(trial.kinematics.model, "right")
     mesh = JW / "geometry" / "tibial_insert.stl"
     insert = load_surface(mesh, "m", "-x,+y,-z", name="insert", closed=True)
@@ -50,8 +50,8 @@ def test_the_muscles_that_cross_the_knee_are_found(jw):
 
 
 @needs_jw
-def test_their_lines_have_the_wrench_of_the_paths_on_shank_and_foot(jw):
-    """In the model's pose. The force of a shrinking wrap object on a path point is included."""
+def test_lines_across_the_knee_have_the_wrench_of_the_paths(jw):
+    """The wrenches on shank and foot include the force of a shrinking wrap object on a point."""
     links, trial, bones = jw
     link = links.tibia
     pulls = bones.pull_on(("tibia", "foot"), "tibia")[:, trial.crossing]
@@ -60,9 +60,9 @@ def test_their_lines_have_the_wrench_of_the_paths_on_shank_and_foot(jw):
     shank = transform(link, trial.shank)
     along = (thigh - shank) / np.linalg.norm(thigh - shank, axis=-1, keepdims=True)
     moment = np.cross(shank, along)
-    apart = np.abs(np.concatenate([moment, along], axis=-1) - pulls).max(axis=(0, 2))
+    differences = np.abs(np.concatenate([moment, along], axis=-1) - pulls).max(axis=(0, 2))
     names = np.array(trial.muscles)[trial.crossing]
-    assert {n for n, d in zip(names, apart, strict=True) if d > 1e-9} == set()
+    assert {n for n, d in zip(names, differences, strict=True) if d > 1e-9} == set()
 
 
 @needs_jw
@@ -73,7 +73,7 @@ def test_slsqp_finds_the_same_forces_in_gait(jw):
         problem = problems.frame(k)
         activation, reserve, _, status = problems.solved(k)
         assert status == "ok"
-        other = minimize(
+        optimum = minimize(
             problem.cost,
             np.full(len(activation), 0.1),
             jac=problem.gradient,
@@ -81,47 +81,49 @@ def test_slsqp_finds_the_same_forces_in_gait(jw):
             method="SLSQP",
             options={"ftol": 1e-13, "maxiter": 300},
         )
-        assert problem.cost(activation) <= problem.cost(other.x) * (1 + 1e-9)
-        np.testing.assert_allclose(activation, other.x, atol=2e-4)
-        np.testing.assert_allclose(problem.others(other.x), reserve, atol=0.02)
+        assert problem.cost(activation) <= problem.cost(optimum.x) * (1 + 1e-9)
+        np.testing.assert_allclose(activation, optimum.x, atol=2e-4)
+        np.testing.assert_allclose(problem.others(optimum.x), reserve, atol=0.02)
 
 
 def walked(names, time, left):
     """Return coordinate -> (n,) of a made-up stride, or of its image in the sagittal plane."""
     reflected = {"pelvis_list", "pelvis_rotation", "pelvis_tz"}
     swing = {"hip_flexion": 0.3, "hip_adduction": 0.1, "hip_rotation": 0.1, "ankle_angle": 0.15}
-    found = {name: np.zeros_like(time) for name in names}
-    for own, phase in (("r", 0.0), ("l", 1.3)):
-        at = {"r": "l", "l": "r"}[own] if left else own
+    result = {name: np.zeros_like(time) for name in names}
+    for leg_side, phase in (("r", 0.0), ("l", 1.3)):
+        at = {"r": "l", "l": "r"}[leg_side] if left else leg_side
         for k, (name, size) in enumerate(swing.items()):
-            found[f"{name}_{at}"] = size * np.sin(6 * time + phase + k)
-        found[f"knee_angle_{at}"] = 0.5 + 0.25 * np.sin(6 * time + phase)
+            result[f"{name}_{at}"] = size * np.sin(6 * time + phase + k)
+        result[f"knee_angle_{at}"] = 0.5 + 0.25 * np.sin(6 * time + phase)
     for k, name in enumerate(("pelvis_tilt", *sorted(reflected))):
         sign = -1.0 if left and name in reflected else 1.0
-        found[name] = sign * (0.02 + 0.05 * np.sin((4 + k) * time))
-    return found | {"pelvis_tx": 1.2 * time, "pelvis_ty": 0.95 + 0.02 * np.sin(9 * time)}
+        result[name] = sign * (0.02 + 0.05 * np.sin((4 + k) * time))
+    return result | {"pelvis_tx": 1.2 * time, "pelvis_ty": 0.95 + 0.02 * np.sin(9 * time)}
 
 
 def test_the_left_leg_of_a_symmetric_model_is_the_mirror_image_of_the_right(tmp_path):
     """A mirrored motion gives the same moments, arms and strengths, and mirrored lines."""
-    time, found = np.linspace(0.0, 1.0, 41), {}
+    time, result = np.linspace(0.0, 1.0, 41), {}
     names = list(model("Rajagopal2016").coordinates)
     for side in ("right", "left"):
         path = tmp_path / f"{side}.mot"
         columns = {"time": time} | walked(names, time, side == "left")
         write_storage(path, columns, in_degrees=False)
         mesh = {"insert_placement": None, "mesh_axes": "+x,+y,+z"}
-        given = {"markers": None, "laboratory_axes": "+x,+y,+z", "cutoff": 6.0, "ground": None}
+        options = {"markers": None, "laboratory_axes": "+x,+y,+z", "cutoff": 6.0, "ground": None}
         recording = LegRecording(
-            PUBLISHED["Rajagopal2016"], side, path, **given, **mesh, sharing=Sharing()
+            PUBLISHED["Rajagopal2016"], side, path, **options, **mesh, sharing=Sharing()
         )
-        found[side] = load_knee_trial(recording, time[5:36:5])
-    (links, right), (mirrored_links, left) = found["right"], found["left"]
+        result[side] = load_knee_trial(recording, time[5:36:5])
+    (links, right), (mirrored_links, left) = result["right"], result["left"]
     assert [name[:-2] for name in right.muscles] == [name[:-2] for name in left.muscles]
     assert all(name.endswith("_l") for name in left.muscles) and len(left.muscles) == 40
     for name in ("moment", "arms", "active", "passive"):
-        one, other = getattr(right.problems, name), getattr(left.problems, name)
-        np.testing.assert_allclose(other, one, atol=1e-9 * np.abs(one).max(initial=1.0))
+        expected, mirrored = getattr(right.problems, name), getattr(left.problems, name)
+        np.testing.assert_allclose(
+            mirrored, expected, atol=1e-9 * np.abs(expected).max(initial=1.0)
+        )
     np.testing.assert_allclose(left.shank @ MIRROR, right.shank, atol=1e-12)
     np.testing.assert_allclose(left.thigh @ MIRROR, right.thigh, atol=1e-12)
     np.testing.assert_allclose(mirrored_links.hip @ MIRROR, links.hip, atol=1e-12)

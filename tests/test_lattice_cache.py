@@ -42,7 +42,7 @@ def cached(counts=(5, 3, 6), limit=1e9, nu=0.45):
 
 
 def solve_in_process(_):
-    """Return a displacement; for a process that shares the cache with others."""
+    """Return a displacement, in a process that shares the cache with others."""
     cache.FACTOR_CACHE = cache.FactorCacheSettings(least_unknowns=1)
     operator, _, solid = cached()
     return operator.solve(np.ones_like(solid.nodes))

@@ -58,15 +58,15 @@ SHAPES = {
 RATIOS = (0.0, 0.25, 0.45, 0.4999)
 USUAL = [0.0, 1e-3, 1.0, 1e3]
 HUGE = [pytest.param(load, marks=pytest.mark.slow) for load in (1e4, 3e4)]
-"""N."""
+"""Loads, N."""
 
 
 @lru_cache
 def prepared(shape, nu=None):
     """Return the prepared contact, the pose and the cell size (mm) of a shape."""
     femoral, insert, pose, size = SHAPES[shape]
-    given = {} if nu is None else {"poisson_ratio": nu}
-    bodies = pair(femoral, insert(), material("polyethylene", **given))
+    changes = {} if nu is None else {"poisson_ratio": nu}
+    bodies = pair(femoral, insert(), material("polyethylene", **changes))
     return contact_model("lattice", size).prepare(bodies), pose, size
 
 
@@ -97,7 +97,7 @@ def compare(state, pose, size, load):
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("load", USUAL + HUGE)
-def test_extreme_shapes_and_loads(shape, load):
+def test_extreme_shapes_and_loads_agree_with_newton_or_fail(shape, load):
     result = compare(*prepared(shape), load)
     if load == 0:
         assert result.status is ContactStatus.OK
@@ -107,7 +107,7 @@ def test_extreme_shapes_and_loads(shape, load):
 
 @pytest.mark.parametrize("nu", RATIOS)
 @pytest.mark.parametrize("load", USUAL + HUGE)
-def test_extreme_ratios(nu, load):
+def test_extreme_poisson_ratios_agree_with_newton_or_fail(nu, load):
     compare(*prepared("level", nu), load)
 
 

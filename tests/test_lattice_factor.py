@@ -131,7 +131,7 @@ def test_displacements_in_single_precision_are_accurate_to_five_parts_in_a_milli
 
 
 def test_mobile_bearing_holds_y_of_the_bottom_and_three_unknowns():
-    """They are the fewest that prevent rigid motion."""
+    """These three are the fewest that prevent rigid motion."""
     solid, held, operator, _ = prepared("mobile", (4, 2, 6), 0.0)
     bottom = int((solid.nodes[:, 1] == 0).sum())
     assert held.sum() == bottom + 3

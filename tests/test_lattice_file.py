@@ -12,7 +12,7 @@ from tkamb.io.mesh_files import lattice_of_file
 INSERT = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "insert.stl"
 
 
-def test_report_and_file(tmp_path, capsys):
+def test_the_lattice_is_reported_and_written(tmp_path, capsys):
     out = tmp_path / "lattice.vtu"
     assert main(["mesh", "lattice", str(INSERT), "--resolution", "3", "--out", str(out)]) == 0
     text = capsys.readouterr().out
@@ -29,7 +29,7 @@ def test_json_holds_the_measures(capsys):
     assert report["out"] is None
 
 
-def test_left_is_the_mirror_image(tmp_path):
+def test_a_left_insert_gives_a_mirrored_lattice(tmp_path):
     right = lattice_of_file(INSERT, 3.0)
     left = lattice_of_file(INSERT, 3.0, side="left", out=tmp_path / "left.vtu")
     assert left.lines()[-1].endswith("the left insert's mirror image")
@@ -45,6 +45,6 @@ def test_left_is_the_mirror_image(tmp_path):
         ({"resolution_mm": 2.0, "out": "lattice.stl"}, "not a .vtu file"),
     ],
 )
-def test_refusals(options, message):
+def test_impossible_options_are_refused(options, message):
     with pytest.raises(InputError, match=message):
         lattice_of_file(INSERT, **options)

@@ -116,7 +116,7 @@ def test_half_cell_rule_and_thin_intervals():
 
 @pytest.mark.parametrize(("begins", "joined"), [(2.4, 1), (2.6, 0), (2.8, 0), (3.4, 0)])
 def test_a_gap_is_closed_if_both_its_ends_have_the_same_node(begins, joined):
-    """The lower interval ends at node 2. The first node of the upper one is nearest to its end."""
+    """The lower interval ends at node 2. The upper one begins at the node nearest to its end."""
     low, high = np.array([0.0, begins]), np.array([2.0, 6.0])
     line = np.zeros(2, int)
     merged, *_, count = _without_narrow_gaps(Intervals(line, line, low, high, 0), low, high)
@@ -301,6 +301,17 @@ def test_shear_of_a_sheared_lattice_is_its_angle():
         assert sheared == pytest.approx((0.2, 0.2, 0.2))
 
 
+def test_the_volume_of_overlapping_bodies_counts_once():
+    block, inner = box_insert(0.04, 0.008, 0.06), box_insert(0.02, 0.004, 0.03)
+    raised = inner.vertices + np.array([0.0, 3e-3, 0.0])
+    vertices = np.concatenate([block.vertices, raised])
+    faces = np.concatenate([block.faces, inner.faces + len(block.vertices)])
+    insert = Surface(vertices, faces, "block with a second body in it")
+    quality = measure_quality(build_grid(insert, 2e-3), insert)
+    assert quality.mesh_volume == pytest.approx(0.04 * 0.008 * 0.06, rel=1e-3)
+    assert abs(quality.volume_error) < 1e-3
+
+
 def test_a_post_has_cells_and_a_notice():
     surface = dished_block(post=(-0.008, 0.002, -0.005, 0.005, 0.025))
     lattice = build_grid(surface, 1e-3)
@@ -359,7 +370,7 @@ def test_an_eminence_is_no_post(name):
 
 
 def classes_agree(a, b):
-    """Return the share of the nodes of both lattices that have the same class in both."""
+    """Return the share of the nodes of either lattice that have the same class in both."""
     shape = tuple(np.maximum(a.index.max(axis=0), b.index.max(axis=0)) + 1)
     dense = [np.full(shape, -1) for _ in range(2)]
     for grid, lattice in zip(dense, (a, b), strict=True):

@@ -38,7 +38,7 @@ def prepared(name):
 
 
 def too_deep(state, result, factor):
-    """Return a failed result with an approach that is too large by a factor, as a guess."""
+    """Return a result with an approach that is too large by a factor, as a guess."""
     pose = state.pair.pose_at_approach(result.pose, factor * result.approach)
     return replace(result, pose=pose)
 
@@ -49,13 +49,13 @@ def columns(state, result):
     row = {"approach": result.approach, "lowest gap": result.gap[result.pressure == 0].min()}
     for side, under_side in (("medial", medial), ("lateral", ~medial)):
         condyle = getattr(result, side)
-        carried = np.where(under_side, result.pressure, 0.0)
+        side_pressure = np.where(under_side, result.pressure, 0.0)
         row |= {
             f"{side} force": condyle.force,
             f"{side} area": condyle.area,
             f"{side} mean pressure": condyle.mean_pressure,
             f"{side} peak pressure": condyle.peak_pressure,
-            f"{side} area above": area_above(result.points, state.triangles, carried, 10e6),
+            f"{side} area above": area_above(result.points, state.triangles, side_pressure, 10e6),
             f"{side} centre x": condyle.centre_of_pressure[0] + 1.0,
             f"{side} centre z": condyle.centre_of_pressure[2] + 1.0,
         }
@@ -119,11 +119,11 @@ def test_area_above_a_level_is_that_of_hertz(level):
 def test_area_above_a_level_is_exact_in_the_mean(level):
     """The mean error over all positions of the grid vanishes, because Hertz's p² is quadratic."""
     shifts = np.arange(8) / 8 * 0.1
-    missed = [
+    errors = [
         share_above(level, 0.1, along, across) - (1 - level**2)
         for along, across in product(shifts, shifts)
     ]
-    assert np.mean(missed) == pytest.approx(0.0, abs=2e-5)
+    assert np.mean(errors) == pytest.approx(0.0, abs=2e-5)
 
 
 def test_area_above_a_level_is_continuous():

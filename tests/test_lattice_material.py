@@ -70,7 +70,7 @@ def test_confined_block_follows_bulk_and_curve(kind, strain, nu):
 
 @pytest.mark.parametrize("strain", [0.003, 0.02, 0.08, 0.2, 0.4])
 def test_shear_curve_gives_the_uniaxial_stress(strain):
-    """At e = eps - sigma/(9 K) it is q = sigma."""
+    """q(e) = sigma at e = eps - sigma/(9 K)."""
     mat = material("polyethylene")
     sigma = mat.stress(strain)
     e = np.array([strain - sigma / (9 * mat.bulk_modulus)])

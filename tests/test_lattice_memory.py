@@ -38,7 +38,7 @@ def test_the_estimate_is_one_to_three_times_the_peak_memory(counts, monkeypatch)
 
 
 def test_memory_of_one_front_is_its_matrix_in_8_bytes_and_in_4():
-    """It has 30 nodes, computed in 8 bytes per number and stored in 4."""
+    """The front has 30 nodes. Its numbers are computed in 8 bytes and stored in 4."""
     nodes = np.arange(30)
     joined = sparse.csr_matrix(np.ones((30, 30)))
     tree = Dissection([nodes], [-1])
@@ -47,7 +47,7 @@ def test_memory_of_one_front_is_its_matrix_in_8_bytes_and_in_4():
 
 
 def test_memory_includes_updates_that_wait_for_their_parent():
-    """Two fronts of 10 nodes have the same parent. The first one's update waits for it."""
+    """Two fronts of 10 nodes have one parent. The update of the first waits for the parent."""
     first, second, between = np.arange(10), np.arange(10, 20), np.arange(20, 30)
     joined = np.ones((30, 30))
     joined[:10, 10:20] = joined[10:20, :10] = 0.0

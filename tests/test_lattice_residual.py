@@ -38,8 +38,8 @@ def test_the_reported_residual_equals_an_independent_measurement(name, load, mon
     bodies = pair(condyles(subdivisions=4), dished_insert(cells=24), material("polyethylene"))
     state, solutions = model.prepare(bodies), []
 
-    def storing_solve(*given):
-        solutions.append(solve(*given))
+    def storing_solve(*arguments):
+        solutions.append(solve(*arguments))
         return solutions[-1]
 
     monkeypatch.setattr(lattice_model, "solve", storing_solve)
@@ -47,9 +47,9 @@ def test_the_reported_residual_equals_an_independent_measurement(name, load, mon
     for start in (None, before):
         result = model.press(state, load, POSE, start)
         solution, settings = solutions[-1], LatticeSolverSettings()
-        pushed = solution.forces.force @ solution.planes.normals[:, 1]
+        vertical_force = solution.forces.force @ solution.planes.normals[:, 1]
         assert result.status is ContactStatus.OK and solution.residual.within(settings)
-        assert abs(-pushed / load - 1) < 1e-9 and (solution.forces.force >= 0).all()
+        assert abs(-vertical_force / load - 1) < 1e-9 and (solution.forces.force >= 0).all()
         assert difference(state, solution, result) < 1e-6
 
 
@@ -97,7 +97,7 @@ FRAMES = {
 def test_the_reported_residual_of_frames_equals_an_independent_measurement(scene):
     """Equal to 1e-6 of the load. For all frames: `scripts/check_residuals`."""
     if not scene.startswith("deep") and not DATA.is_dir():
-        pytest.skip("the subjects' files are not beside the project")
+        pytest.skip("the measured data are missing")
     changes = {"contact.model": "lattice", "contact.resolution_mm": 3.0}
     solver = FrameSolver(load_case(load_scene(MODELS / scene, changes)))
     with recorded_solutions() as presses:

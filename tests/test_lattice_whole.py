@@ -178,9 +178,9 @@ def test_the_winding_number_agrees_with_the_intervals_of_lines(seed):
     steps = [(x, 0.0, z) for x in (-1e-7, 1e-7) for z in (-1e-7, 1e-7)]
     inner = [surface.winding.inside(middle + step) for step in steps]
     assert (np.any(inner, axis=0) | near_wall).all()
-    apart = result.first[1:] == result.first[:-1]
-    apart &= result.second[1:] == result.second[:-1]
+    same_line = result.first[1:] == result.first[:-1]
+    same_line &= result.second[1:] == result.second[:-1]
     gap = np.column_stack(
         [x[result.second[1:]], (result.lower[1:] + result.upper[:-1]) / 2, z[result.first[1:]]]
-    )[apart]
+    )[same_line]
     assert not surface.winding.inside(gap).any()

@@ -51,8 +51,7 @@ def bundle_of(**changes: object) -> Ligament:
     [(two_line_force, 9e4, 9e4 * SLACK), (quadratic_toe_force, 2750.0, 2750.0)],
 )
 def test_laws(law: object, stiffness: float, terminal: float) -> None:
-    """A slack ligament has no tension, both branches meet at 2 eps1, and the terminal slope is
-    k."""
+    """A slack ligament has no tension. Both branches meet at twice the toe strain."""
     strain = np.array(
         [
             -0.5,
@@ -93,24 +92,24 @@ def test_forces_are_equal_and_opposite() -> None:
 
 def test_gathered_loads_are_those_of_the_bundles() -> None:
     toe = {"law": "quadratic-toe", "stiffness_N_per_mm": None, "stiffness_N_per_strain": 2750.0}
-    given = [
+    tables = [
         bundle_of(),
         bundle_of(name="LCL", **toe),
         bundle_of(name="slack", reference_strain=-0.1),
     ]
-    bundles = build_ligaments(given, POSES, FLEXION)
-    here = {"femur": POSES["femur"][0], "tibia": np.eye(4)}
-    tension, loads = ligament_loads(bundles, here)
-    alone = [ligament_loads([bundle], here) for bundle in bundles]
+    bundles = build_ligaments(tables, POSES, FLEXION)
+    poses = {"femur": POSES["femur"][0], "tibia": np.eye(4)}
+    tension, loads = ligament_loads(bundles, poses)
+    single_loads = [ligament_loads([bundle], poses) for bundle in bundles]
     assert tension == pytest.approx(
-        [float(bundle.force(bundle.length(here))) for bundle in bundles]
+        [float(bundle.force(bundle.length(poses))) for bundle in bundles]
     )
     assert tension[2] == 0.0
     assert len(loads) == 2
     for load in loads:
-        own = [part for _, pair in alone for part in pair if part.link == load.link]
+        parts = [part for _, pair in single_loads for part in pair if part.link == load.link]
         point = np.array([0.1, 0.2, 0.3])
-        assert total_wrench([load], point) == pytest.approx(total_wrench(own, point))
+        assert total_wrench([load], point) == pytest.approx(total_wrench(parts, point))
 
 
 def test_slack_length_is_taken_as_given() -> None:
@@ -165,28 +164,28 @@ def test_generic_set_scales_with_the_implant() -> None:
         "generic_LCL",
     ]
     axis = condylar_axis(cylinder(0.02, 0.07))
-    for one, two in zip(small, large, strict=True):
-        reach = one.proximal.position - axis
-        assert two.proximal.position - axis == pytest.approx(2 * reach, abs=1e-5)
-        assert two.distal.position == pytest.approx(2 * one.distal.position)
+    for first, second in zip(small, large, strict=True):
+        reach = first.proximal.position - axis
+        assert second.proximal.position - axis == pytest.approx(2 * reach, abs=1e-5)
+        assert second.distal.position == pytest.approx(2 * first.distal.position)
     with pytest.raises(InputError, match="ITB"):
         generic_ligaments(cylinder(0.02, 0.07), slab(0.075), np.eye(4), ("ITB",))
 
 
-def test_generic_ends_stand_in_half_widths_of_their_part() -> None:
+def test_generic_ends_scale_with_the_half_width_of_their_part() -> None:
     """The deep MCL ends at the insert's medial edge, the LCL beyond the lateral one."""
-    found = {
+    bundles = {
         bundle.name.removeprefix("generic_"): bundle
         for bundle in generic_ligaments(cylinder(0.02, 0.07), slab(0.075), np.eye(4))
     }
-    assert found["MCL_deep"].distal.position[2] == pytest.approx(-0.0375)
-    assert found["LCL"].distal.position[2] == pytest.approx(1.10 * 0.0375)
+    assert bundles["MCL_deep"].distal.position[2] == pytest.approx(-0.0375)
+    assert bundles["LCL"].distal.position[2] == pytest.approx(1.10 * 0.0375)
     middle = 0.001  # of the component's width
-    assert found["MCL_anterior"].proximal.position[2] - middle == pytest.approx(-1.20 * 0.035)
+    assert bundles["MCL_anterior"].proximal.position[2] - middle == pytest.approx(-1.20 * 0.035)
 
 
 def test_generic_set_is_plausible_on_the_shipped_knee() -> None:
-    """Collaterals within 12 % of slack over 0-90 deg; the PCL tightens with flexion."""
+    """Collateral strains stay within 12 % from 0 to 90 deg, and the PCL tightens with flexion."""
     case = load_case(
         load_scene(Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml")
     )

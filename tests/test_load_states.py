@@ -1,4 +1,4 @@
-"""Six load states of one knee: the position of the ground reaction decides on the state."""
+"""Six load states of one knee, which the position of the ground reaction selects."""
 
 from dataclasses import replace
 from itertools import product
@@ -14,7 +14,7 @@ from tkamb.knee.load import PointForces
 from tkamb.knee.unknowns import LoadState, Solution, wrong_signs
 
 FRICTION = 0.05
-CARRIED = (
+ONE_SIDED_LOADS = (
     "medial_normal",
     "lateral_normal",
     "muscle_quadriceps",
@@ -39,7 +39,7 @@ ASIDE = {"none": 0.0, "medial": 0.12, "lateral": -0.12}
 
 
 @pytest.mark.parametrize(("ahead", "lifted"), list(product(AHEAD, ASIDE)))
-def test_the_ground_reaction_decides_on_each_of_six_load_states(knee, ahead, lifted):
+def test_the_ground_reaction_selects_each_of_six_load_states(knee, ahead, lifted):
     """A ground reaction behind the knee needs the quadriceps. A ground reaction beside the condyles
     lifts the far condyle.
     """
@@ -49,13 +49,12 @@ def test_the_ground_reaction_decides_on_each_of_six_load_states(knee, ahead, lif
     assert loads.lifted == frozenset(() if lifted == "none" else (lifted,))
     assert loads.slack == (ahead == "slack")
     assert not loads.ambiguous
-    assert min(loads.values.get(name, 0.0) for name in CARRIED) >= 0.0
+    assert min(loads.values.get(name, 0.0) for name in ONE_SIDED_LOADS) >= 0.0
     if loads.slack:
-        assert (
-            loads.values["residual_flexion"] < 0.0
-        )  # a flexion moment on the tibia replaces flexors
+        # a flexion moment on the tibia replaces flexors
+        assert loads.values["residual_flexion"] < 0.0
     if loads.lifted:
-        # on the tibia, about x: the moment that a pull of the lifted condyle would have
+        # the moment about x that a pull of the lifted condyle would exert on the tibia
         assert loads.values["residual_coronal"] * {"medial": -HALF, "lateral": HALF}[lifted] < 0.0
 
 
@@ -64,8 +63,8 @@ def test_a_slack_quadriceps_adds_nothing_to_the_contact_force(knee):
     force = solve_knee(loaded(knee, 700 * UP, [0.08, -0.45, 0.0]), FRICTION).contact_force
     state = knee.state
     gravity = 9.80665 * 4.2
-    lean = state.pose("tibia")[:3, :3] @ UP
-    assert force[1] == pytest.approx(700 - gravity * lean[1], abs=1.0)
+    shank_axis = state.pose("tibia")[:3, :3] @ UP
+    assert force[1] == pytest.approx(700 - gravity * shank_axis[1], abs=1.0)
 
 
 @pytest.mark.parametrize("off", ["medial", "lateral"])
@@ -88,7 +87,7 @@ def test_a_knee_in_traction_fails_with_the_reasons_of_all_load_states(knee):
 
 
 def test_a_patella_that_would_have_to_pull_fails_the_frame(knee):
-    """A slack quadriceps would give right signs but could not balance the load."""
+    """With a slack quadriceps an extension moment is missing."""
     turned = replace(knee.extensor, contact_normal=-knee.extensor.contact_normal)
     geometry = replace(loaded(knee, 700 * UP, [-0.06, -0.45, 0.0]), extensor=turned)
     (problem,) = solve_knee(geometry, FRICTION).problems
@@ -115,24 +114,24 @@ def test_a_knee_without_contact_that_needs_extension_is_not_slack():
     st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2)),
     st.tuples(*[st.floats(-20, 20)] * 3),
 )
-def test_no_solution_of_a_random_load_has_a_wrong_sign(knee, aside, up, place, moment):
-    """Signs are right, omitted loads would have wrong signs, the shank is in equilibrium."""
-    force = np.array([aside[0], up, aside[2]])
-    geometry = loaded(knee, force, [place[0], -0.45, place[1]], moment)
+def test_no_solution_of_a_random_load_has_a_wrong_sign(knee, shear, up, point, moment):
+    """Loads have right signs, zero loads would have wrong signs, the shank is in equilibrium."""
+    force = np.array([shear[0], up, shear[2]])
+    geometry = loaded(knee, force, [point[0], -0.45, point[1]], moment)
     loads = solve_knee(geometry, FRICTION)
     if loads.problems:
         assert loads.values == {}
         return
     values = loads.values
-    assert min(values.get(name, 0.0) for name in CARRIED) >= -1e-6
+    assert min(values.get(name, 0.0) for name in ONE_SIDED_LOADS) >= -1e-6
     if loads.slack:
         assert values["residual_flexion"] <= 0.25
     for side in loads.lifted:
         assert values["residual_coronal"] * (-1 if side == "medial" else 1) <= 1e-6
-    assert np.allclose(shank_imbalance(geometry, loads), 0.0, atol=1e-6)
+    assert np.allclose(shank_residual(geometry, loads), 0.0, atol=1e-6)
 
 
-def shank_imbalance(geometry, loads):
+def shank_residual(geometry, loads):
     """Return the residual force (3,) on the shank, insert frame."""
     values, state = loads.values, geometry.state
     weight = -9.80665 * 4.2 * (state.pose("tibia")[:3, :3] @ UP)

@@ -147,9 +147,9 @@ def test_negative_indices_count_back_from_their_line(tmp_path):
     path.write_text(text, encoding="utf-8")
     vertices, triangles = read_triangles(path)
     assert len(vertices) == 2 * count
-    both = Surface(vertices, triangles)
-    assert both.volume == pytest.approx(2 * 9 * area_of(NOTCHED))
-    assert np.ptp(both.bounds[:, 0]) == pytest.approx(110.0)
+    surface = Surface(vertices, triangles)
+    assert surface.volume == pytest.approx(2 * 9 * area_of(NOTCHED))
+    assert np.ptp(surface.bounds[:, 0]) == pytest.approx(110.0)
 
 
 @pytest.mark.parametrize(
@@ -238,7 +238,7 @@ def knee():
 
 
 @pytest.mark.parametrize("width", [0.052, 0.070, 0.085])
-def test_inches_are_suggested_and_a_too_small_knee_is_refused(width):
+def test_the_unit_follows_from_the_width_of_a_knee(width):
     inches, millimetres = width / 0.0254, width * 1e3
     assert plausible_units(inches) == ["inch"]
     assert plausible_units(millimetres) == ["mm"]

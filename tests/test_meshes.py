@@ -26,7 +26,7 @@ from tkamb.io.recordings.meshes import (
 )
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
-needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the real data are not here")
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the measured data are missing")
 
 
 def save(path, surface, scale=1e3):
@@ -164,9 +164,9 @@ def test_each_repair_restores_the_body_with_one_notice(tmp_path, caplog):
     for words, faces in cases.items():
         caplog.clear()
         path = save(tmp_path / "broken.ply", Surface(insert.vertices, faces))
-        mended = load_surface(path, "mm", name="insert", closed=True)
-        assert mended.mesh.is_watertight
-        assert mended.mesh.volume == pytest.approx(insert.mesh.volume, rel=1e-5)
+        repaired = load_surface(path, "mm", name="insert", closed=True)
+        assert repaired.mesh.is_watertight
+        assert repaired.mesh.volume == pytest.approx(insert.mesh.volume, rel=1e-5)
         assert len(caplog.records) == 1
         assert caplog.records[0].levelno == logging.WARNING
         assert words in caplog.text
@@ -192,12 +192,12 @@ def test_any_mixture_of_small_defects_is_repaired(seed, lost, flipped, doubled, 
     vertices = ball.vertices
     if split:
         vertices, faces = vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
-    mended = repair(vertices, faces)
-    surface = Surface(mended.vertices, mended.faces)
-    wide = [hole for hole in mended.holes if len(hole.vertices) <= 3]
+    repaired = repair(vertices, faces)
+    surface = Surface(repaired.vertices, repaired.faces)
+    wide = [hole for hole in repaired.holes if len(hole.vertices) <= 3]
     assert not wide
     assert surface.mesh.is_winding_consistent
-    if not mended.holes:
+    if not repaired.holes:
         assert surface.mesh.is_watertight
         assert surface.mesh.volume == pytest.approx(ball.mesh.volume, rel=5e-3)
 
@@ -205,9 +205,9 @@ def test_any_mixture_of_small_defects_is_repaired(seed, lost, flipped, doubled, 
 def test_unreferenced_vertices_are_removed_with_a_notice(tmp_path, caplog):
     insert = two_dishes()
     more = Surface(np.concatenate([insert.vertices, [[0.0, 0.5, 0.0]]]), insert.faces)
-    mended = load_surface(save(tmp_path / "loose.ply", more), "mm", name="insert", closed=True)
+    repaired = load_surface(save(tmp_path / "loose.ply", more), "mm", name="insert", closed=True)
     assert "1 unreferenced vertex" in caplog.text
-    assert mended.bounds[1, 1] < 0.02
+    assert repaired.bounds[1, 1] < 0.02
 
 
 def test_a_fold_without_thickness_is_removed():
@@ -215,19 +215,19 @@ def test_a_fold_without_thickness_is_removed():
     tip = ball.vertices[ball.faces[0]].mean(axis=0) * 1.2
     a, b, n = *ball.faces[0][:2], len(ball.vertices)
     folded = np.concatenate([ball.faces, [[a, b, n], [n, b, a]]])
-    mended = repair(np.vstack([ball.vertices, tip]), folded)
-    assert len(mended.faces) == len(ball.faces)
-    assert mended.notices[0] == "2 duplicate faces removed"
+    repaired = repair(np.vstack([ball.vertices, tip]), folded)
+    assert len(repaired.faces) == len(ball.faces)
+    assert repaired.notices[0] == "2 duplicate faces removed"
 
 
 def test_cracks_are_welded():
     insert = two_dishes()
     rng = np.random.default_rng(2)
     corners = insert.triangles.reshape(-1, 3) + rng.uniform(-1e-5, 1e-5, (3 * len(insert.faces), 3))
-    mended = repair(corners, np.arange(len(corners)).reshape(-1, 3))
-    assert not mended.holes
-    assert any("welded" in notice for notice in mended.notices)
-    volume = Surface(mended.vertices, mended.faces).mesh.volume
+    repaired = repair(corners, np.arange(len(corners)).reshape(-1, 3))
+    assert not repaired.holes
+    assert any("welded" in notice for notice in repaired.notices)
+    volume = Surface(repaired.vertices, repaired.faces).mesh.volume
     assert volume == pytest.approx(insert.mesh.volume, rel=1e-3)
 
 
@@ -235,9 +235,9 @@ def test_a_void_inside_stays_a_void():
     shell = sphere(0.03, 3)
     void = sphere(0.02, 3)
     faces = np.concatenate([shell.faces, void.faces[:, ::-1] + len(shell.vertices)])
-    mended = repair(np.concatenate([shell.vertices, void.vertices]), faces)
-    assert mended.notices == ()
-    volume = Surface(mended.vertices, mended.faces).mesh.volume
+    repaired = repair(np.concatenate([shell.vertices, void.vertices]), faces)
+    assert repaired.notices == ()
+    volume = Surface(repaired.vertices, repaired.faces).mesh.volume
     assert volume == pytest.approx(shell.mesh.volume - void.mesh.volume)
 
 
@@ -383,16 +383,16 @@ def test_real_inserts_with_lost_triangles_and_jitter(tmp_path, subject, caplog):
     insert = load_surface(path, "m", "-x,+y,-z", name="insert", closed=True)
     rng = np.random.default_rng(4)
     lost = without(insert, rng.choice(len(insert.faces), 20, replace=False))
-    mended = load_surface(save(tmp_path / "lost.stl", lost), "mm", name="insert", closed=True)
+    repaired = load_surface(save(tmp_path / "lost.stl", lost), "mm", name="insert", closed=True)
     assert "small holes closed" in caplog.text
-    assert mended.mesh.volume == pytest.approx(insert.mesh.volume, rel=1e-5)
+    assert repaired.mesh.volume == pytest.approx(insert.mesh.volume, rel=1e-5)
     moved = insert.vertices + rng.normal(0.0, 1e-5, insert.vertices.shape)
     noisy = Surface(moved, insert.faces)
     rough = load_surface(save(tmp_path / "noisy.stl", noisy), "mm", name="insert", closed=True)
     assert rough.mesh.volume == pytest.approx(insert.mesh.volume, rel=1e-3)
 
 
-def test_a_binary_stl_is_read_like_by_trimesh(tmp_path):
+def test_a_binary_stl_is_read_as_by_trimesh(tmp_path):
     path = save(tmp_path / "ball.stl", sphere(0.02))
     theirs = trimesh.load(path, force="mesh", process=False)
     vertices, faces = read_triangles(path)

@@ -204,7 +204,7 @@ def refused(tmp_path, message, recorded=None, **changes):
     assert "\n" not in str(caught.value)
 
 
-def test_refusals(tmp_path):
+def test_invalid_recordings_are_refused(tmp_path):
     good = coordinate_columns(bend())
     refused(tmp_path, "axial_rotation runs from .* deg, which no knee does", angle_unit="rad")
     refused(tmp_path, "unknown role 'flex'", columns={"flex": "flexion"})

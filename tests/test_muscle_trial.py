@@ -26,7 +26,7 @@ def hamstring(name="hamstring", depth=-0.04, **numbers):
     return muscle(name, *ends, **numbers)
 
 
-def held(model, knee, frames=1):
+def still_leg(model, knee, frames=1):
     """Return the motion of a leg that is still, bent by an angle (rad)."""
     q = np.tile([0.0, knee, 0.0], (frames, 1))
     return CoordinateMotion(np.arange(frames) / 100.0, q, 0.0 * q, 0.0 * q)
@@ -37,52 +37,52 @@ def gravity_about_knee(knee):
     return G * (MASSES["tibia_r"] * 0.2 + MASSES["foot_r"] * SHANK) * np.sin(knee)
 
 
-def test_one_muscle_carries_what_gravity_asks_for():
+def test_one_muscle_balances_gravity():
     model = plane_leg(hamstring())
     sharing = Sharing(coordinates=KNEE, reserve=0.0)
     knee = -0.5
-    trial = solve_trial(model, held(model, knee), {}, sharing=sharing)
+    trial = solve_trial(model, still_leg(model, knee), {}, sharing=sharing)
     assert trial.status == ("ok",)
     needed = gravity_about_knee(knee)
     assert trial.moment[0, 0] == pytest.approx(needed)
     lever = trial.moment_arm_m[0, 0, 0]
     assert trial.force_N[0, 0] == pytest.approx(needed / lever)
-    # by geometry: the line's distance from the knee's axis
+    # The arm is the line's distance from the knee's axis.
     turn = np.array([[np.cos(knee), -np.sin(knee)], [np.sin(knee), np.cos(knee)]])
-    here, there = np.array([-0.04, 0.0]), turn @ [-0.04, -0.3]
-    u = (there - here) / np.linalg.norm(there - here)
-    assert lever == pytest.approx(there[1] * u[0] - there[0] * u[1])
+    origin, insertion = np.array([-0.04, 0.0]), turn @ [-0.04, -0.3]
+    u = (insertion - origin) / np.linalg.norm(insertion - origin)
+    assert lever == pytest.approx(insertion[1] * u[0] - insertion[0] * u[1])
 
 
 def test_two_muscles_share_by_strength_lever_and_weight():
-    """Of min Σ w a² under Σ r F a = M: a is as r F / w."""
+    """At the minimum of Σ w a² with Σ r F a = M, a is proportional to r F / w."""
     pair = hamstring("long", -0.05, force=900.0), hamstring("short", -0.03, force=1500.0)
     model = plane_leg(*pair)
     for weights, w in (("equal", np.ones(2)), ("volume", np.array([900.0, 1500.0]))):
         sharing = Sharing(coordinates=KNEE, reserve=0.0, weights=weights)
-        trial = solve_trial(model, held(model, -0.6), {}, sharing=sharing)
+        trial = solve_trial(model, still_leg(model, -0.6), {}, sharing=sharing)
         strength = trial.moment_arm_m[0, :, 0] * [900.0, 1500.0]
         shape = strength / w
         expected = shape * trial.moment[0, 0] / (strength @ shape)
         np.testing.assert_allclose(trial.activation[0], expected, rtol=1e-9)
 
 
-def test_what_is_pushed_on_the_foot_enters_as_its_moment():
+def test_a_moment_on_the_foot_changes_the_knee_moment():
     model = plane_leg(hamstring(force=1e5))
     push = {"foot_r": np.array([[0.0, 0.0, 40.0, 0.0, 0.0, 0.0]])}  # N·m, straightens the knee
     sharing = Sharing(coordinates=KNEE, reserve=0.0)
-    with_it = solve_trial(model, held(model, -0.5), push, sharing=sharing)
-    without = solve_trial(model, held(model, -0.5), {}, sharing=sharing)
+    with_it = solve_trial(model, still_leg(model, -0.5), push, sharing=sharing)
+    without = solve_trial(model, still_leg(model, -0.5), {}, sharing=sharing)
     assert with_it.moment[0, 0] - without.moment[0, 0] == pytest.approx(-40.0)
-    more = (with_it.force_N - without.force_N)[0, 0]
-    assert more == pytest.approx(-40.0 / with_it.moment_arm_m[0, 0, 0])
+    difference = (with_it.force_N - without.force_N)[0, 0]
+    assert difference == pytest.approx(-40.0 / with_it.moment_arm_m[0, 0, 0])
 
 
-def test_reserves_are_returned_with_what_muscles_carry():
+def test_muscle_moments_and_reserves_sum_to_the_joint_moment():
     model = plane_leg(hamstring(force=50.0))
-    trial = solve_trial(model, held(model, -0.8), {}, sharing=Sharing(reserve=1.0))
-    carried = np.einsum("fm,fmc->fc", trial.force_N, trial.moment_arm_m)
-    np.testing.assert_allclose(carried + trial.reserve, trial.moment, atol=1e-12)
+    trial = solve_trial(model, still_leg(model, -0.8), {}, sharing=Sharing(reserve=1.0))
+    muscle_moment = np.einsum("fm,fmc->fc", trial.force_N, trial.moment_arm_m)
+    np.testing.assert_allclose(muscle_moment + trial.reserve, trial.moment, atol=1e-12)
     assert trial.activation[0, 0] == pytest.approx(1.0) and trial.reserve[0, 1] < -1.0
 
 
@@ -125,15 +125,17 @@ def test_frames_fail_with_a_reason_and_no_numbers():
 def test_fibres_beyond_their_curves_fail_by_name():
     long = hamstring(optimal_fibre_length_m=0.04, tendon_slack_length_m=0.2)
     model = plane_leg(long)
-    trial = solve_trial(model, held(model, -0.2), {}, sharing=Sharing(law="hill"))
+    trial = solve_trial(model, still_leg(model, -0.2), {}, sharing=Sharing(law="hill"))
     assert trial.status == ("failed: fibres beyond 1.8 optimal lengths in hamstring",)
 
 
 def test_hill_muscles_pull_passively_and_with_less_strength():
-    own = hamstring(optimal_fibre_length_m=0.08, tendon_slack_length_m=0.2)
-    model = plane_leg(own)
-    trial = solve_trial(model, held(model, -0.3), {}, sharing=Sharing(law="hill", reserve=FREE))
-    # free of cost, so idle: what is left pulls passively, (L - slack)/l_o about 1.2
+    muscle_ = hamstring(optimal_fibre_length_m=0.08, tendon_slack_length_m=0.2)
+    model = plane_leg(muscle_)
+    trial = solve_trial(
+        model, still_leg(model, -0.3), {}, sharing=Sharing(law="hill", reserve=FREE)
+    )
+    # The reserve costs nothing: the muscle is idle and pulls passively at (L - slack)/l_o = 1.2.
     assert trial.activation[0, 0] == pytest.approx(0.0, abs=1e-9)
     length = np.linalg.norm(_line(model, -0.3))
     stretch = (length - 0.2) / 0.08
@@ -142,16 +144,16 @@ def test_hill_muscles_pull_passively_and_with_less_strength():
 
 
 def _line(model, knee):
-    own = model.muscles["hamstring"].path.points
+    points = model.muscles["hamstring"].path.points
     points, _ = (
         Kinematics(model)
         .motion([0.0, knee, 0.0])
-        .points([p.body for p in own], [p.location for p in own])
+        .points([p.body for p in points], [p.location for p in points])
     )
     return points[1] - points[0]
 
 
-def test_twins_measure_and_do_not_pull():
+def test_a_length_twin_carries_no_force():
     twin = muscle("copy", ("femur_r", [0.0, -0.1, 0.0]), ("tibia_r", [0.05, -0.05, 0.0]))
     whole = muscle(
         "whole",
@@ -181,19 +183,19 @@ def test_twins_measure_and_do_not_pull():
 def test_options_that_make_no_sense_are_refused(change, message):
     model = plane_leg(hamstring())
     with pytest.raises(InputError, match=message):
-        solve_trial(model, held(model, -0.2), {}, sharing=Sharing(**change))
+        solve_trial(model, still_leg(model, -0.2), {}, sharing=Sharing(**change))
 
 
 def test_motion_and_loads_that_do_not_fit_are_refused():
     model = plane_leg(hamstring())
     with pytest.raises(InputError, match="no body 'calcn_r'"):
-        solve_trial(model, held(model, 0.0), {"calcn_r": np.zeros((1, 6))})
+        solve_trial(model, still_leg(model, 0.0), {"calcn_r": np.zeros((1, 6))})
     with pytest.raises(InputError, match="2 rows for 1 times"):
-        solve_trial(model, held(model, 0.0), {"foot_r": np.zeros((2, 6))})
+        solve_trial(model, still_leg(model, 0.0), {"foot_r": np.zeros((2, 6))})
     with pytest.raises(InputError, match="not finite"):
-        solve_trial(model, held(model, np.nan), {})
+        solve_trial(model, still_leg(model, np.nan), {})
     with pytest.raises(InputError, match="left knee"):
-        solve_trial(model, held(model, 0.0), {}, side="left")
+        solve_trial(model, still_leg(model, 0.0), {}, side="left")
 
 
 def test_coordinates_are_read_by_name_or_path(tmp_path):
@@ -218,19 +220,19 @@ def walking():
 
 @needs_jw
 def test_a_gait_trial_is_optimal_and_continuous_in_every_frame(walking):
-    _, found = walking
-    assert len(found.muscles) == 44 and set(found.status) == {"ok"}
-    assert found.coordinates == (
+    _, result = walking
+    assert len(result.muscles) == 44 and set(result.status) == {"ok"}
+    assert result.coordinates == (
         *("hip_flexion", "hip_adduction", "hip_rotation"),
         *("knee_flexion", "ankle_angle", "subtalar_angle"),
     )
-    assert found.kkt_residual.max() < 1e-8
-    assert np.abs(np.diff(found.activation, axis=0)).max() < 0.2  # at 120 Hz
-    assert found.activation.min() > -1e-9 and found.activation.max() < 1.0 + 1e-9
+    assert result.kkt_residual.max() < 1e-8
+    assert np.abs(np.diff(result.activation, axis=0)).max() < 0.2  # at 120 Hz
+    assert result.activation.min() > -1e-9 and result.activation.max() < 1.0 + 1e-9
 
 
 @needs_jw
-def test_forces_are_those_that_the_balance_asks_for(walking):
-    _, found = walking
-    carried = np.einsum("fm,fmc->fc", found.force_N, found.moment_arm_m) + found.reserve
-    np.testing.assert_allclose(carried, found.moment, atol=1e-8)
+def test_forces_and_reserves_balance_the_moments(walking):
+    _, result = walking
+    muscle_moment = np.einsum("fm,fmc->fc", result.force_N, result.moment_arm_m) + result.reserve
+    np.testing.assert_allclose(muscle_moment, result.moment, atol=1e-8)

@@ -1,4 +1,4 @@
-"""A muscle is data: named, moved, given via points by the scene alone; what is refused."""
+"""The scene alone defines a muscle: name, points and wrapping. Impossible muscles are refused."""
 
 import numpy as np
 import pytest
@@ -28,17 +28,17 @@ def case_of(folder, *muscles, drop=BARE):
 def test_the_long_form_of_the_quadriceps_gives_the_same_numbers(tmp_path):
     short = write_scene(tmp_path / "short", ("contact",))
     long = write_scene(tmp_path / "long", ("contact", "quadriceps"), muscle=[muscle()])
-    one, other = (simulate(load_scene(path, FEW)) for path in (short, long))
-    assert np.isfinite(one["quadriceps_N"]).all()
-    for name, values in one.columns.items():
+    first, other = (simulate(load_scene(path, FEW)) for path in (short, long))
+    assert np.isfinite(first["quadriceps_N"]).all()
+    for name, values in first.columns.items():
         if name != "status" and not name.endswith("seconds"):
             assert np.array_equal(values, other[name], equal_nan=True), name
 
 
 def test_a_muscle_renamed_and_moved_by_data_pulls_with_its_own_moment_arm(tmp_path):
     """The generalised force of unit tension is -dL/dq for all nine joint coordinates."""
-    moved = {"link": "femur", "point_mm": [25.0, 180.0, 9.0]}
-    case = case_of(tmp_path, muscle("vastus_lateralis", (moved, INSERTION)))
+    origin = {"link": "femur", "point_mm": [25.0, 180.0, 9.0]}
+    case = case_of(tmp_path, muscle("vastus_lateralis", (origin, INSERTION)))
     mechanics = mechanics_of(case)
     frame, chain = mechanics.frame(2), mechanics.knee.chain
     assert frame.loads.values["muscle_vastus_lateralis"] > 100.0
@@ -56,7 +56,7 @@ def test_a_muscle_renamed_and_moved_by_data_pulls_with_its_own_moment_arm(tmp_pa
     (unknown,) = frame.geometry.muscles
     arms = frame.geometry.state.generalised([unknown.loads])[chain._columns, 0]
     assert -np.array(slopes) == pytest.approx(arms, abs=1e-6)
-    assert np.abs(arms[6:]).max() > 0.5  # it pulls on the patella
+    assert np.abs(arms[6:]).max() > 0.5  # The muscle pulls on the patella.
 
 
 def test_a_via_point_on_the_femur_lengthens_the_muscle_and_moves_its_pull(tmp_path):
@@ -65,13 +65,13 @@ def test_a_via_point_on_the_femur_lengthens_the_muscle_and_moves_its_pull(tmp_pa
     bent = case_of(tmp_path / "a", muscle(path=(ORIGIN, via, INSERTION), wraps=False))
     direct = case_of(tmp_path / "b", muscle(path=(via, INSERTION), wraps=False))
     bent, direct = mechanics_of(bent), mechanics_of(direct)
-    far, near = (one.frame(0) for one in (bent, direct))
+    far, near = (first.frame(0) for first in (bent, direct))
     assert not far.loads.problems
     for name, value in near.loads.values.items():
         assert far.loads.values[name] == pytest.approx(value, rel=1e-9, abs=1e-7)
-    paths = [one.extensor.lines.paths(one.geometry(0).state)[0] for one in (bent, direct)]
-    apart = np.subtract(ORIGIN["point_mm"], via["point_mm"]) * 1e-3
-    assert paths[0].length - paths[1].length == pytest.approx(np.linalg.norm(apart))
+    paths = [first.extensor.lines.paths(first.geometry(0).state)[0] for first in (bent, direct)]
+    difference = np.subtract(ORIGIN["point_mm"], via["point_mm"]) * 1e-3
+    assert paths[0].length - paths[1].length == pytest.approx(np.linalg.norm(difference))
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_a_via_point_on_the_femur_lengthens_the_muscle_and_moves_its_pull(tmp_pa
         ([muscle(insertion=INSERTION)], "unknown key 'muscle.0.insertion'"),
     ],
 )
-def test_what_cannot_be_balanced_or_read_is_one_clear_line(tmp_path, muscles, words):
+def test_an_indeterminate_or_malformed_muscle_is_a_one_line_error(tmp_path, muscles, words):
     with pytest.raises(InputError) as error:
         case_of(tmp_path, *muscles)
     assert words in str(error.value)

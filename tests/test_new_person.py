@@ -31,7 +31,7 @@ def test_a_left_leg_is_the_mirror_image_of_the_right_one(knees):
         np.testing.assert_allclose(knees["left"][name], knees["right"][name], rtol=1e-3, atol=0.1)
 
 
-def test_neither_leg_is_asked_about(knees):
+def test_neither_leg_raises_a_question(knees):
     for results in knees.values():
         assert results.summary["questions"] == []
 

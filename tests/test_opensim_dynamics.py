@@ -8,7 +8,8 @@ from opensim_references import references
 from tkamb.io.opensim.motion import inverse_dynamics
 
 TOLERANCE = {"JW": 1e-8, "gait2392": 1e-8, "DM": 5e-3, "Rajagopal2016": 0.05}
-"""N and N·m. OpenSim differs by this much where splines rotate a joint: see the next test."""
+"""N and N·m. OpenSim's own error is this large where splines rotate a joint, see
+`test_force_on_the_pelvis_is_the_rate_of_momentum`."""
 
 
 def energy(chain, q, rates):
@@ -62,11 +63,11 @@ def test_force_on_the_pelvis_is_the_rate_of_momentum(name):
 
     h = 2e-4
     path = [first_moment(q + s * rates + 0.5 * s**2 * second) for s in h * np.arange(-2, 3)]
-    pulled = np.array([-1.0, 16.0, -30.0, 16.0, -1.0]) @ path / (12.0 * h**2)
-    found = inverse_dynamics(chain, q, rates, second)[0]
+    expected_rate = np.array([-1.0, 16.0, -30.0, 16.0, -1.0]) @ path / (12.0 * h**2)
+    forces = inverse_dynamics(chain, q, rates, second)[0]
     pelvis = [chain.coordinates[f"pelvis_t{axis}"] for axis in "xyz"]
-    expected = pulled - model.mass_kg * model.gravity
-    np.testing.assert_allclose(found[pelvis], expected, atol=1e-4)
+    expected = expected_rate - model.mass_kg * model.gravity
+    np.testing.assert_allclose(forces[pelvis], expected, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
@@ -74,5 +75,5 @@ def test_generalised_forces_are_those_of_opensim(name):
     chain, truth = kinematics(name), references()[name]
     count = len(truth["dynamics"])
     rates, second, forces = (np.array(v) for v in zip(*truth["dynamics"], strict=True))
-    found = inverse_dynamics(chain, np.array(truth["q"])[:count], rates, second)
-    np.testing.assert_allclose(found, forces, atol=TOLERANCE[name])
+    computed = inverse_dynamics(chain, np.array(truth["q"])[:count], rates, second)
+    np.testing.assert_allclose(computed, forces, atol=TOLERANCE[name])

@@ -31,24 +31,24 @@ def written(folder: Path, text: str | bytes, name: str = "model.osim") -> Path:
     return path
 
 
-def assert_same(one: OpenSimModel, other: OpenSimModel) -> None:
+def assert_same(first: OpenSimModel, other: OpenSimModel) -> None:
     """Assert that two models have the same bodies, poses and paths."""
-    assert one.bodies.keys() == other.bodies.keys()
-    for name, body in one.bodies.items():
+    assert first.bodies.keys() == other.bodies.keys()
+    for name, body in first.bodies.items():
         np.testing.assert_array_equal(body.inertia, other.bodies[name].inertia)
     for part in ("coordinates", "markers", "muscles", "ligaments", "wrap_objects"):
-        assert list(getattr(one, part)) == list(getattr(other, part))
+        assert list(getattr(first, part)) == list(getattr(other, part))
     for part in ("couplers", "constant_distances"):
-        assert [c.name for c in getattr(one, part)] == [c.name for c in getattr(other, part)]
-    q = np.linspace(-0.3, 0.4, len(one.coordinates))
-    np.testing.assert_array_equal(*(Kinematics(m).poses(q) for m in (one, other)))
+        assert [c.name for c in getattr(first, part)] == [c.name for c in getattr(other, part)]
+    q = np.linspace(-0.3, 0.4, len(first.coordinates))
+    np.testing.assert_array_equal(*(Kinematics(m).poses(q) for m in (first, other)))
 
 
 def cut_out(text: str, tag: str) -> tuple[str, str]:
     """Return a set of the model, and the model without it."""
-    found = re.search(rf"<{tag}[ >].*?</{tag}>", text, re.S)
-    assert found
-    return found[0], text.replace(found[0], f'<{tag} file="parts/{tag}.xml"/>')
+    match = re.search(rf"<{tag}[ >].*?</{tag}>", text, re.S)
+    assert match
+    return match[0], text.replace(match[0], f'<{tag} file="parts/{tag}.xml"/>')
 
 
 SETS = ("BodySet", "JointSet", "ConstraintSet", "ForceSet", "MarkerSet")
@@ -63,24 +63,26 @@ WITH_MARKER = NEW.replace("</Model>", MARKER + "</Model>")
 @pytest.mark.parametrize("wrapped", ["document", "bare"])
 @pytest.mark.parametrize("tag", SETS)
 def test_a_set_in_a_file_of_its_own_is_read(tmp_path, tag, wrapped):
-    held, rest = cut_out(WITH_MARKER, tag)
+    element, remainder = cut_out(WITH_MARKER, tag)
     (tmp_path / "parts").mkdir()
     if wrapped == "document":
-        held = f'<?xml version="1.0"?><OpenSimDocument Version="40000">{held}</OpenSimDocument>'
-    written(tmp_path / "parts", held, f"{tag}.xml")
-    read = read_osim(written(tmp_path, rest))
+        element = (
+            f'<?xml version="1.0"?><OpenSimDocument Version="40000">{element}</OpenSimDocument>'
+        )
+    written(tmp_path / "parts", element, f"{tag}.xml")
+    read = read_osim(written(tmp_path, remainder))
     assert_same(read, read_osim(written(tmp_path, WITH_MARKER, "whole.osim")))
     assert read.notices == (f"{tag} read from parts/{tag}.xml",)
 
 
 def test_a_run_reads_the_files_that_its_model_names(tmp_path):
     """A change of a set in its own file makes another run, which `verify` detects."""
-    held, rest = cut_out(NEW, "ForceSet")
+    element, remainder = cut_out(NEW, "ForceSet")
     (tmp_path / "parts").mkdir()
-    forces = written(tmp_path / "parts", held.replace("<objects>", '<objects file="more.xml">'))
+    forces = written(tmp_path / "parts", element.replace("<objects>", '<objects file="more.xml">'))
     forces = forces.rename(forces.with_name("ForceSet.xml"))
     more = written(tmp_path / "parts", "<objects/>", "more.xml")
-    model = written(tmp_path, rest)
+    model = written(tmp_path, remainder)
     assert named_files(model) == [forces, more]
     scene = SimpleNamespace(model_dump=lambda exclude: {"muscles": {"model": model}})
     case = SimpleNamespace(femoral=None, scene=scene)
@@ -90,16 +92,16 @@ def test_a_run_reads_the_files_that_its_model_names(tmp_path):
 
 
 def test_a_files_own_defaults_hold_for_its_own_elements(tmp_path):
-    held, rest = cut_out(NEW, "ForceSet")
-    strengths = re.findall(r"<max_isometric_force>(.*?)<", held)
-    bare = re.sub(r"<max_isometric_force>.*?</max_isometric_force>", "", held)
+    element, remainder = cut_out(NEW, "ForceSet")
+    strengths = re.findall(r"<max_isometric_force>(.*?)<", element)
+    bare = re.sub(r"<max_isometric_force>.*?</max_isometric_force>", "", element)
     default = (
         "<defaults><Thelen2003Muscle><max_isometric_force>321</max_isometric_force>"
         "</Thelen2003Muscle></defaults>"
     )
     (tmp_path / "parts").mkdir()
     written(tmp_path / "parts", bare.replace("<objects>", default + "<objects>", 1), "ForceSet.xml")
-    muscles = read_osim(written(tmp_path, rest)).muscles.values()
+    muscles = read_osim(written(tmp_path, remainder)).muscles.values()
     forces = {m.max_isometric_force_N for m in muscles if m.kind == "Thelen2003Muscle"}
     assert strengths and forces == {321.0}
 
@@ -110,17 +112,17 @@ def test_a_files_own_defaults_hold_for_its_own_elements(tmp_path):
         (None, "does not exist"),
         ("<ForceSet><objects/></ForceSet>", "instead of a <JointSet>"),
         ("<OpenSimDocument><ForceSet/></OpenSimDocument>", "without a <JointSet>"),
-        ('<JointSet file="JointSet.xml"/>', "names it in turn"),
+        ('<JointSet file="JointSet.xml"/>', "includes this one"),
         ("<JointSet><objects>", "no element found: line 1"),
     ],
 )
 def test_a_set_whose_file_cannot_be_used_is_refused(tmp_path, content, words):
-    _, rest = cut_out(NEW, "JointSet")
+    _, remainder = cut_out(NEW, "JointSet")
     (tmp_path / "parts").mkdir()
     if content:
         written(tmp_path / "parts", content, "JointSet.xml")
     with pytest.raises(InputError, match=re.escape(words)):
-        read_osim(written(tmp_path, rest))
+        read_osim(written(tmp_path, remainder))
 
 
 def test_a_controllers_file_may_be_missing(tmp_path):
@@ -153,7 +155,7 @@ def test_xml_that_opensim_reads_is_read(tmp_path, case):
 
 
 @pytest.mark.parametrize("gravity", ["(0 -9.5 0)", "~[0,-9.5,0]", "0, -9.5, 0"])
-def test_three_numbers_in_brackets_or_between_commas(tmp_path, gravity):
+def test_three_numbers_in_brackets_or_with_commas_are_read(tmp_path, gravity):
     text = re.sub("<gravity>.*?</gravity>", f"<gravity>{gravity}</gravity>", NEW)
     np.testing.assert_array_equal(read_osim(written(tmp_path, text)).gravity, [0.0, -9.5, 0.0])
 
@@ -178,7 +180,7 @@ def test_a_byte_order_mark_is_no_fault(tmp_path):
         ("<gravity>", "<credits>m < 5 & > 3</credits><gravity>", ("line 9", "write &lt; for a <")),
     ],
 )
-def test_xml_that_nobody_reads_names_line_column_and_remedy(tmp_path, old, new, words):
+def test_malformed_xml_is_refused_with_line_column_and_remedy(tmp_path, old, new, words):
     with pytest.raises(InputError) as error:
         read_osim(written(tmp_path, NEW.replace(old, new, 1)))
     assert all(word in str(error.value) for word in words), str(error.value)
@@ -229,18 +231,18 @@ def test_couplers_in_a_chain_do_not_depend_on_their_order(tmp_path, order):
     np.testing.assert_allclose(values, [hip, turn, -2.0 * turn + 0.01], rtol=1e-14)
     slopes = kinematics.coupling(q)[:, place["knee_r_0"]]
     assert slopes[place["ankle_r_0"]] == pytest.approx(0.5 * 0.3 * -2.0)
-    # what follows over others moves the markers too
+    # A coordinate that depends through several couplers also moves markers.
     chain = ModelChain(model, list(model.markers))
     state = np.tile(q, (1, 1))
     target = chain.places(state) + 0.01
     equations = chain.normal(state, target, np.ones((1, len(model.markers))))
     step, knee = 1e-6, chain.free.index(place["knee_r_0"])
-    both = []
+    costs = []
     for sign in (1, -1):
         move = np.zeros((1, len(chain.free)))
         move[0, knee] = sign * step
-        both.append(((target - chain.places(chain.moved(state, move))) ** 2).sum())
-    slope = -(both[0] - both[1]) / (4 * step)
+        costs.append(((target - chain.places(chain.moved(state, move))) ** 2).sum())
+    slope = -(costs[0] - costs[1]) / (4 * step)
     assert equations.right[0, knee] == pytest.approx(slope, rel=1e-5)
 
 
@@ -255,7 +257,7 @@ def test_couplers_in_a_chain_do_not_depend_on_their_order(tmp_path, order):
 def test_couplers_that_contradict_each_other_are_refused(tmp_path, more, words):
     with pytest.raises(InputError, match=words):
         coupled(tmp_path, *CHAIN, more)
-    with pytest.raises(InputError, match=words):  # this knee's
+    with pytest.raises(InputError, match=words):  # The couplers concern this knee.
         find_leg(coupled(tmp_path, *CHAIN, more, partial=True), "right")
 
 
@@ -331,10 +333,10 @@ NOT_NEEDED = {
 
 
 @pytest.mark.parametrize("case", NOT_NEEDED)
-def test_what_one_knee_does_not_need_is_a_notice(tmp_path, capsys, case):
+def test_an_unreadable_element_that_the_knee_does_not_need_is_a_notice(tmp_path, capsys, case):
     assert main(recorded_leg(tmp_path, osim=NOT_NEEDED[case])) == 0
     assert "not needed for this knee" in capsys.readouterr().out
-    with pytest.raises(InputError):  # who asks for the whole model is told
+    with pytest.raises(InputError):  # A complete reading does not accept the element.
         read_osim(tmp_path / "leg.osim")
 
 
@@ -361,18 +363,18 @@ NEEDED = {
 
 
 @pytest.mark.parametrize("case", NEEDED)
-def test_what_the_knee_needs_is_refused(tmp_path, capsys, case):
+def test_an_unreadable_element_that_the_knee_needs_is_refused(tmp_path, capsys, case):
     changes = {old: new for old, new in NEEDED[case].items() if new is not None}
     if case == "knee":
         changes["</PinJoint><PinJoint"] = "</ScrewJoint><PinJoint"
     assert main(recorded_leg(tmp_path, osim=changes)) == 2
-    said = capsys.readouterr().err
-    assert "not read" in said or "needs one independent" in said
+    output = capsys.readouterr().err
+    assert "not read" in output or "needs one independent" in output
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("kind", ["Schutte1993Muscle", "Delp1990Muscle", "Thelen2003Muscle"])
-def test_muscle_classes_by_their_older_names(tmp_path, kind):
+def test_muscle_classes_with_older_names_are_read(tmp_path, kind):
     text = OWN["old_layout"].read_text(encoding="utf-8")
     assert "Delp1990Muscle_Deprecated" in text
     model = read_osim(written(tmp_path, text.replace("Delp1990Muscle_Deprecated", kind)))
@@ -394,7 +396,7 @@ def as_connectors(text: str, style: str) -> str:
 @pytest.mark.parametrize(
     ("style", "version"), [("connectors", 30501), ("connector", 30508), ("socket", 30512)]
 )
-def test_the_versions_between_3_and_4(tmp_path, style, version):
+def test_versions_between_3_and_4_are_read(tmp_path, style, version):
     text = as_connectors(NEW, style).replace("40600", str(version))
     assert_same(read_osim(written(tmp_path, text)), read_osim(OWN["new_layout"]))
 
@@ -407,7 +409,7 @@ def test_the_versions_between_3_and_4(tmp_path, style, version):
         (("+y", "+z"), np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0.0]])),
     ],
 )
-def test_a_frame_defined_by_stations(tmp_path, axes, turn):
+def test_a_frame_defined_by_stations_is_read(tmp_path, axes, turn):
     """Stations that define the knee's frame on the femur give the same frame as an offset."""
     places = {"a": (0, 0, 0), "b": (0.1, 0, 0), "c": (0.02, 0, -0.1), "o": (0, -0.4, 0)}
     stations = "".join(
@@ -432,12 +434,12 @@ def test_a_frame_defined_by_stations(tmp_path, axes, turn):
 
 
 @pytest.mark.parametrize("unit", ["metres", "Meters", "m"])
-def test_spellings_of_the_metre(tmp_path, unit):
+def test_spellings_of_the_metre_are_accepted(tmp_path, unit):
     text = NEW.replace("<length_units>meters", f"<length_units>{unit}")
     assert_same(read_osim(written(tmp_path, text)), read_osim(OWN["new_layout"]))
 
 
-# A leg alone: pelvis without mass.
+# A model of one leg: the pelvis has no mass.
 ALONE = {"<mass>40.0<": "<mass>0<"}
 
 
@@ -455,7 +457,9 @@ ALONE = {"<mass>40.0<": "<mass>0<"}
         ),
     ],
 )
-def test_a_model_of_one_leg(tmp_path, capsys, masses, subject, leg_kg, words):
+def test_the_mass_of_a_model_of_one_leg_is_kept_or_scaled(
+    tmp_path, capsys, masses, subject, leg_kg, words
+):
     arguments = changed(recorded_leg(tmp_path, osim=masses), mass_kg=subject)
     assert main(arguments) == 0
     assert words in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""OpenSim's functions, poses and Jacobians beside analytic values, differences and OpenSim."""
+"""Functions, poses and Jacobians agree with analytic values, finite differences and OpenSim."""
 
 import numpy as np
 import pytest
@@ -83,7 +83,7 @@ def test_a_backwards_joint_is_the_same_joint():
     assert relative[1, 3] == pytest.approx(0.03)
 
 
-def test_couplers_are_followed():
+def test_dependent_coordinates_follow_their_couplers():
     chain = kinematics("Rajagopal2016")
     q = chain.coupled({"knee_angle_r": 0.7})
     assert q[chain.coordinates["knee_angle_r_beta"]] == pytest.approx(0.7)

@@ -21,15 +21,15 @@ def wrap(shape, *dimensions, quadrant=None):
     return WrapObject(shape, "ground", shape, np.eye(4), dimensions, quadrant, True)
 
 
-def length(found, start, end):
-    ends = np.linalg.norm(found.entry - start, axis=1) + np.linalg.norm(end - found.exit, axis=1)
-    return np.where(found.touches, ends + found.arc_m, np.linalg.norm(end - start, axis=1))
+def length(result, start, end):
+    ends = np.linalg.norm(result.entry - start, axis=1) + np.linalg.norm(end - result.exit, axis=1)
+    return np.where(result.touches, ends + result.arc_m, np.linalg.norm(end - start, axis=1))
 
 
 def touched(shape, start, end, moves=False):
     start, end = np.atleast_2d(start).astype(float), np.atleast_2d(end).astype(float)
-    found = touch(shape, start, end, np.full((len(start), 2), moves))
-    return found, length(found, start, end)
+    result = touch(shape, start, end, np.full((len(start), 2), moves))
+    return result, length(result, start, end)
 
 
 def around_circle(first, second, sweep, radius):
@@ -49,7 +49,7 @@ def cut(shape, rng, count=400):
     return ends[:, (share > 0) & (share < 1) & (nearest < 0.999)] * axes
 
 
-def test_geodesic_of_a_sphere():
+def test_a_string_over_a_sphere_has_the_closed_form_length():
     radius = 0.04
     start, end = cut((radius,) * 3, np.random.default_rng(0))
     strings = shortest_strings(start, end, np.full(3, radius))
@@ -62,7 +62,7 @@ def test_geodesic_of_a_sphere():
     np.testing.assert_allclose(by_sphere, truth, atol=1e-14)
 
 
-def test_geodesic_in_the_plane_of_symmetry():
+def test_a_string_in_a_plane_of_symmetry_has_the_length_over_an_ellipse():
     """In a plane of symmetry the string over an ellipsoid is the string over an ellipse."""
     a, b = 0.05, 0.03
     start, end = np.array([[-0.08, 0.01, 0.0]]), np.array([[0.09, 0.012, 0.0]])
@@ -86,8 +86,8 @@ def test_strings_are_tangent_and_found_always(axes):
     for point, other in ((strings.entry, start), (strings.exit, end)):
         np.testing.assert_allclose(((point / axes) ** 2).sum(1), 1.0, atol=1e-5)
         normal = point / np.square(axes)
-        away = (other - point) / np.linalg.norm(other - point, axis=1, keepdims=True)
-        slope = (away * normal).sum(1) / np.linalg.norm(normal, axis=1)
+        direction = (other - point) / np.linalg.norm(other - point, axis=1, keepdims=True)
+        slope = (direction * normal).sum(1) / np.linalg.norm(normal, axis=1)
         np.testing.assert_allclose(slope, 0.0, atol=1e-9)
     back = shortest_strings(end, start, np.array(axes))
     np.testing.assert_allclose(back.length_m, strings.length_m, atol=1e-6)
@@ -95,20 +95,20 @@ def test_strings_are_tangent_and_found_always(axes):
 
 def test_cylinder_unrolls():
     radius, start, end = 0.03, np.array([-0.05, 0.01, -0.02]), np.array([0.07, 0.02, 0.04])
-    _, found = touched(wrap("cylinder", radius, 1.0), start, end)
+    _, result = touched(wrap("cylinder", radius, 1.0), start, end)
     first, second = np.hypot(*start[:2]), np.hypot(*end[:2])
     sweep = np.arccos(start[:2] @ end[:2] / first / second)
     plane = around_circle(first, second, sweep, radius)
-    assert found[0] == pytest.approx(np.hypot(plane, 0.06), abs=1e-15)
+    assert result[0] == pytest.approx(np.hypot(plane, 0.06), abs=1e-15)
 
 
 def test_half_sends_the_string_the_long_way_round():
     radius, start, end = 0.03, np.array([-0.05, 0.01, 0.0]), np.array([0.07, 0.02, 0.0])
-    found, long = touched(wrap("cylinder", radius, 1.0, quadrant=(1, -1)), start, end)
+    result, long = touched(wrap("cylinder", radius, 1.0, quadrant=(1, -1)), start, end)
     first, second = np.hypot(*start[:2]), np.hypot(*end[:2])
     sweep = 2.0 * np.pi - np.arccos(start[:2] @ end[:2] / first / second)
     assert long[0] == pytest.approx(around_circle(first, second, sweep, radius), abs=1e-15)
-    assert found.entry[0, 1] < 0.0
+    assert result.entry[0, 1] < 0.0
     _, by_sphere = touched(wrap("sphere", radius, quadrant=(1, -1)), start, end)
     assert by_sphere[0] == pytest.approx(long[0], abs=1e-15)
 
@@ -122,38 +122,38 @@ def test_string_beyond_a_cylinder_passes_freely():
 def test_ring_turns_a_string_at_its_inside():
     ring, tube, ahead, height = 0.02, 0.005, 0.05, 0.04
     start, end = np.array([ahead, 0.0, height]), np.array([ahead, 0.0, -height])
-    _, found = touched(wrap("torus", ring, tube), start, end)
+    _, result = touched(wrap("torus", ring, tube), start, end)
     distance = np.hypot(ahead - ring, height)
     sweep = 2.0 * (np.pi - np.arctan2(height, ahead - ring))
-    assert found[0] == pytest.approx(around_circle(distance, distance, sweep, tube), abs=1e-12)
+    assert result[0] == pytest.approx(around_circle(distance, distance, sweep, tube), abs=1e-12)
     free = touched(wrap("torus", ring, tube), [0.003, 0, height], [-0.002, 0, -height])[0]
     assert not free.touches[0]
 
 
 def test_two_objects_share_a_tangent():
     """Between two equal spheres the string is horizontal."""
-    radius, apart = 0.03, 0.1
+    radius, distance = 0.03, 0.1
     sphere = wrap("sphere", radius)
     poses = np.tile(np.eye(4), (1, 2, 1, 1))
-    poses[0, :, 0, 3] = (apart / 2, -apart / 2)
+    poses[0, :, 0, 3] = (distance / 2, -distance / 2)
     start, end = np.array([[-0.12, 0.01, 0.0]]), np.array([[0.12, 0.01, 0.0]])
-    yes = np.ones((1, 2), bool)
-    found = strings_over([sphere, sphere], poses, start, end, yes, np.ones((1, 2, 2), bool))
-    np.testing.assert_array_equal(found.order, [[1, 0]])
-    np.testing.assert_allclose(found.exit[0, 1], [-apart / 2, radius, 0.0], atol=1e-9)
-    np.testing.assert_allclose(found.entry[0, 0], [apart / 2, radius, 0.0], atol=1e-9)
-    side = np.hypot(0.12 - apart / 2, 0.01)
-    sweep = np.pi / 2 - np.arctan2(0.01, 0.12 - apart / 2)
+    allowed = np.ones((1, 2), bool)
+    result = strings_over([sphere, sphere], poses, start, end, allowed, np.ones((1, 2, 2), bool))
+    np.testing.assert_array_equal(result.order, [[1, 0]])
+    np.testing.assert_allclose(result.exit[0, 1], [-distance / 2, radius, 0.0], atol=1e-9)
+    np.testing.assert_allclose(result.entry[0, 0], [distance / 2, radius, 0.0], atol=1e-9)
+    side = np.hypot(0.12 - distance / 2, 0.01)
+    sweep = np.pi / 2 - np.arctan2(0.01, 0.12 - distance / 2)
     arc = radius * (sweep - np.arccos(radius / side))
-    np.testing.assert_allclose(found.arc_m, arc, atol=1e-10)
+    np.testing.assert_allclose(result.arc_m, arc, atol=1e-10)
 
 
 @pytest.mark.parametrize("shape", [("cylinder", 0.03, 1.0), ("sphere", 0.03)])
 def test_touching_begins_without_a_jump(shape):
     start, end = np.array([-0.05, 0.0, 0.01]), np.array([0.07, 0.0, 0.02])
     rise = np.outer(np.linspace(0.02, 0.04, 401), [0.0, 1.0, 0.0])
-    found, lengths = touched(wrap(*shape), start + rise, end + rise)
-    assert found.touches[0] and not found.touches[-1]
+    result, lengths = touched(wrap(*shape), start + rise, end + rise)
+    assert result.touches[0] and not result.touches[-1]
     assert np.abs(np.diff(lengths)).max() < 1e-4
 
 
@@ -165,8 +165,8 @@ def test_an_ellipsoid_yields_to_a_point_that_moves_into_it():
     end = np.tile([0.09, 0.012, 0.01], (601, 1))
     _, lengths = touched(ellipsoid, start, end, moves=True)
     assert np.abs(np.diff(lengths)).max() < 1e-4
-    _, lost = touched(ellipsoid, start, end)
-    assert np.abs(np.diff(lost)).max() > 1e-3
+    _, ignoring = touched(ellipsoid, start, end)
+    assert np.abs(np.diff(ignoring)).max() > 1e-3
 
 
 @pytest.mark.parametrize("name", [*OWN, *PUBLISHED])
@@ -184,10 +184,10 @@ def test_moment_arms_are_the_derivative_of_length(name):
             direction[k] = near * rng.normal()
     h = 1e-5
     ahead, behind = (lines.at(chain.coupled(q) + s * direction) for s in (h, -h))
-    found = lines.at(chain.coupled(q))
-    assert np.isfinite(found.lengths_m).all()
+    result = lines.at(chain.coupled(q))
+    assert np.isfinite(result.lengths_m).all()
     np.testing.assert_allclose(
-        -(ahead.lengths_m - behind.lengths_m) / (2.0 * h), found.moment_arms @ direction, atol=1e-6
+        -(ahead.lengths_m - behind.lengths_m) / (2.0 * h), result.moment_arms @ direction, atol=1e-6
     )
 
 
@@ -200,11 +200,11 @@ def test_paths_without_wraps_are_those_of_opensim(name):
 
 
 @pytest.mark.parametrize("name", ["old_layout", "DM", "JW", "Rajagopal2016"])
-def test_moment_arms_over_the_range_of_the_joints(name):
-    """Cylinders and spheres within a millimetre of OpenSim's; ellipsoids mostly the same.
+def test_moment_arms_over_the_range_of_the_joints_agree_with_opensim(name):
+    """Moment arms over cylinders agree within 0.6 mm, over ellipsoids in the median within 0.1 mm.
 
-    OpenSim lets a path pass one segment only around an object, though it cuts others, and
-    loses an ellipsoid once a point lies in it: there, and with a torus, they differ.
+    OpenSim wraps only one segment of a path around an object, and ignores an ellipsoid if a point
+    lies in it. In these cases, and with a torus, tkamb differs.
     """
     chain, truth = kinematics(name), references()[name]
     differences = {"cylinder": [], "sphere": [], "ellipsoid": [], "torus": []}
@@ -212,10 +212,10 @@ def test_moment_arms_over_the_range_of_the_joints(name):
         q = np.tile(chain.vector({}), (len(arms), 1))
         column = chain.coordinates[coordinate]
         q[:, column] = np.linspace(low, high, len(arms))
-        found = LineSet(chain, [muscle]).at(q).moment_arms[:, 0, column]
+        result = LineSet(chain, [muscle]).at(q).moment_arms[:, 0, column]
         used = chain.model.muscles[muscle].path.wraps[0].wrap_object
         shape = chain.model.wrap_objects[used].shape
-        differences[shape].append(np.abs(found - arms).max())
+        differences[shape].append(np.abs(result - arms).max())
     assert max(differences["cylinder"], default=0.0) < 6e-4
     assert max(differences["sphere"], default=0.0) < 1e-6
     assert np.median(differences["ellipsoid"] or [0.0]) < 1e-4
@@ -230,33 +230,33 @@ def test_moment_arms_over_the_range_of_the_joints(name):
     ],
 )
 def test_no_length_jumps_over_an_ellipsoid(coordinate, muscles):
-    """OpenSim's jump by up to 13.6 mm (psoas, -43 deg) and 12.9 mm (gracilis) within a degree."""
+    """OpenSim's lengths jump by up to 13.6 mm (psoas, -43 deg) within a degree."""
     chain = kinematics("DM")
     column, step = chain.coordinates[coordinate], np.radians(1.0)
     low, high = chain.model.coordinates[coordinate].range
     q = np.tile(chain.vector({}), (int((high - low) / step), 1))
     q[:, column] = low + step * np.arange(len(q))
-    found = LineSet(chain, muscles).at(q)
-    arms = np.abs(found.moment_arms[..., column])
+    result = LineSet(chain, muscles).at(q)
+    arms = np.abs(result.moment_arms[..., column])
     bound = step * np.maximum(arms[1:], arms[:-1]) + 1e-4
-    assert (np.abs(np.diff(found.lengths_m, axis=0)) < bound).all()
+    assert (np.abs(np.diff(result.lengths_m, axis=0)) < bound).all()
 
 
 def test_a_string_never_turns_back_where_it_leaves():
-    """JW's biceps at 136 to 144 deg ends 1 mm off the ellipsoid; the string must not overshoot."""
+    """JW's biceps at 136 to 144 deg ends 1 mm off the ellipsoid. Its string does not overshoot."""
     chain = kinematics("JW")
     column = chain.coordinates["knee_flexion"]
     degrees = np.arange(-136.0, -144.1, -0.5)
     q = np.tile(chain.vector({}), (len(degrees), 1))
     q[:, column] = np.radians(degrees)
-    found = LineSet(chain, ["bflh"]).at(q)
+    result = LineSet(chain, ["bflh"]).at(q)
     step = (
         np.radians(0.5)
         * 0.5
-        * (found.moment_arms[1:, 0, column] + found.moment_arms[:-1, 0, column])
+        * (result.moment_arms[1:, 0, column] + result.moment_arms[:-1, 0, column])
     )
-    np.testing.assert_allclose(np.diff(found.lengths_m[:, 0]), step, atol=1e-6)
-    # an end close to the surface: the shorter of the two ways that end there tangent to it
+    np.testing.assert_allclose(np.diff(result.lengths_m[:, 0]), step, atol=1e-6)
+    # Two tangent strings lead to an end close to the surface. The result is the shorter one.
     axes, end = np.array([0.034, 0.083, 0.022]), np.array([0.856, 0.534, 0.071])
     start = np.array([[-6.0, -0.15, 7.5]]) * axes
     strings = shortest_strings(start, end[None] * axes, axes, np.array([0.0, 0.0, -1.0]))

@@ -31,7 +31,7 @@ def test_both_layouts_hold_the_same_model():
         ]
 
 
-def test_numbers_of_the_small_model():
+def test_the_small_model_has_the_numbers_of_its_file():
     small = model("old_layout")
     assert small.mass_kg == pytest.approx(25.3)
     np.testing.assert_array_equal(small.bodies["femur"].inertia[0], [0.13, 0.001, -0.002])
@@ -55,7 +55,9 @@ def test_numbers_of_the_small_model():
         ("Rajagopal2016", 22, 39, 80, 0, 66, 40, 75.337),
     ],
 )
-def test_published_models(name, bodies, coordinates, muscles, ligaments, markers, wraps, mass_kg):
+def test_published_models_are_read(
+    name, bodies, coordinates, muscles, ligaments, markers, wraps, mass_kg
+):
     read = model(name)
     assert (len(read.bodies), len(read.joints)) == (bodies, bodies)
     assert (len(read.coordinates), len(read.muscles)) == (coordinates, muscles)
@@ -64,8 +66,8 @@ def test_published_models(name, bodies, coordinates, muscles, ligaments, markers
     assert read.mass_kg == pytest.approx(mass_kg, abs=1e-3)
 
 
-def test_traps_of_jw():
-    """Two joints have offset frames of one name; the knee leads from the tray to the femur."""
+def test_equal_frame_names_and_a_backwards_knee_of_jw_are_read():
+    """Two joints have offset frames of one name. The knee's parent is the tray, not the femur."""
     jw = model("JW")
     joints = {joint.name: joint for joint in jw.joints}
     weld, knee = joints["tibial_tray_weld"], joints["knee"]
@@ -78,7 +80,7 @@ def test_traps_of_jw():
     assert "CoordinateCouplerConstraint 'patfem_ty_con' (not enforced)" in jw.left_out
 
 
-def test_ligaments_of_dm():
+def test_the_ligaments_of_dm_are_read():
     dm = model("DM")
     assert {ligament.kind for ligament in dm.ligaments.values()} == {"Blankevoort1991Ligament"}
     capsule = dm.ligaments["pCAP1"]
@@ -100,7 +102,7 @@ REFUSED = {
     "spline": ("-2.1 -1.6 -1", "-2.1 -1.6 -1.7", "x increasing"),
     "wrap": ("WrapTorus", "WrapDonut", "WrapDonut 'ring'"),
     "wrap size": ("<radius>0.02<", "<radius>-0.02<", "not positive"),
-    "wrap name": ("<wrap_object>ring", "<wrap_object>rong", "'rong' that is not there"),
+    "wrap name": ("<wrap_object>ring", "<wrap_object>rong", "'rong' that does not exist"),
     "quadrant": ("<quadrant>x<", "<quadrant>w<", "<quadrant>w</quadrant>"),
     "range": ("<range>1 2</range>", "<range>1 5</range>", "range 1 5"),
     "muscle": ("Delp1990Muscle_Deprecated", "Hill1938Muscle", "Hill1938Muscle 'moving'"),
@@ -114,7 +116,7 @@ REFUSED = {
     "number": ("<mass>9<", "<mass>nine<", "<mass>nine</mass> is not 1 number"),
     "nan": ("<mass>9<", "<mass>nan<", "is not 1 number"),
     "negative mass": ("<mass>9<", "<mass>-9<", "a mass of -9 kg"),
-    "coordinate twice": ('"hip_y"', '"hip_x"', "is there twice"),
+    "coordinate twice": ('"hip_y"', '"hip_x"', "is defined twice"),
     "point": ("<PathPoint ", "<FloatingPoint ", None),
     "condition": ("<coordinate>knee<", "<coordinate>elbow<", "coordinate 'elbow'"),
     "axis": ("<axis>0.78717961 0.60474746 -0.12094949<", "<axis>0 0 0<", "axis of no length"),
@@ -123,10 +125,10 @@ REFUSED = {
 
 @pytest.mark.parametrize("case", REFUSED)
 def test_what_cannot_be_read_is_refused_by_name(case, tmp_path):
-    wrong, right, says = REFUSED[case]
+    original, replacement, words = REFUSED[case]
     text = OWN["old_layout"].read_text(encoding="utf-8")
-    assert wrong in text
-    text = text.replace(wrong, right)
+    assert original in text
+    text = text.replace(original, replacement)
     if case == "point":
         text = text.replace("</PathPoint>", "</FloatingPoint>")
     if case == "constraint":
@@ -136,10 +138,10 @@ def test_what_cannot_be_read_is_refused_by_name(case, tmp_path):
     with pytest.raises(InputError) as error:
         read_osim(path)
     assert str(path) in str(error.value) and "\n" not in str(error.value)
-    assert (says or right.strip("< ")) in str(error.value)
+    assert (words or replacement.strip("< ")) in str(error.value)
 
 
-def test_missing_and_truncated_files(tmp_path):
+def test_missing_and_truncated_files_are_refused(tmp_path):
     with pytest.raises(InputError, match="no such OpenSim model"):
         read_osim(tmp_path / "none.osim")
     path = tmp_path / "half.osim"

@@ -56,7 +56,7 @@ OUTLINES = {
     "hexagon": arc(12.0, 0, 300, 6),
     "box": rectangle(10.3, 7.7),
 }
-"""Convex outlines (n, 2), x and z in mm, against the clock."""
+"""Convex outlines (n, 2), x and z in mm, counter-clockwise."""
 AT_TWO_SIZES = ("disc", "D", "turned square", "turned rectangle", "hexagon", "box")
 
 
@@ -125,9 +125,9 @@ def test_the_area_of_a_node_is_the_consistent_tributary_area():
     """A square gives each corner a quarter. For a distorted face it is an integral."""
     points = np.array([[0, 0, 0], [0, 0, 2], [2, 0, 2], [2, 0, 0]], float)
     assert consistent_areas(points, np.array([[0, 1, 2, 3]])) == pytest.approx(1.0)
-    drawn = points.copy()
-    drawn[2] = [1, 0, 1]  # on the line between its neighbours
-    areas = consistent_areas(drawn, np.array([[0, 1, 2, 3]]))
+    distorted = points.copy()
+    distorted[2] = [1, 0, 1]  # on the line between its neighbours
+    areas = consistent_areas(distorted, np.array([[0, 1, 2, 3]]))
     assert areas.sum() == pytest.approx(2.0)
     assert areas == pytest.approx([2 / 3, 1 / 2, 1 / 3, 1 / 2])
 

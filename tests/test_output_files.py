@@ -47,8 +47,8 @@ def test_import_replaces_no_file_of_somebody_else(tmp_path, capsys, name, conten
     (tmp_path / "out" / "notes.txt").write_bytes(b"\r\n")
     before = contents(tmp_path / "out")
     assert main(arguments) == 2
-    said = capsys.readouterr().err
-    assert f"{name}: exists already" in said and "choose another --out" in said
+    output = capsys.readouterr().err
+    assert f"{name}: exists already" in output and "choose another --out" in output
     assert contents(tmp_path / "out") == before
 
 
@@ -70,7 +70,7 @@ def test_two_trials_of_one_subject_share_the_patient(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["dangling link", "folder"])
-def test_what_is_no_file_is_not_replaced_either(tmp_path, kind):
+def test_a_link_or_folder_is_not_replaced(tmp_path, kind):
     arguments, place = recorded_leg(tmp_path), tmp_path / "out" / "patient.urdf"
     place.parent.mkdir()
     place.symlink_to(tmp_path / "elsewhere") if kind == "dangling link" else place.mkdir()
@@ -96,14 +96,14 @@ def test_a_failing_import_leaves_the_folder_as_it_was(tmp_path, monkeypatch, err
     monkeypatch.chdir(tmp_path)
     assert main(arguments) != 0
     after = contents(tmp_path / "out")
-    logs = [name for name in after if name.startswith("tkamb-error-")]  # of what nobody foresaw
+    logs = [name for name in after if name.startswith("tkamb-error-")]  # of unexpected errors
     assert {name: text for name, text in after.items() if name not in logs} == before
 
 
 @pytest.mark.parametrize(
     "name", ["../scene.toml", "/tmp/scene.toml", "patient.urdf", "a/b.toml", ""]
 )
-def test_the_scenes_name_is_a_name(tmp_path, capsys, name):
+def test_a_scene_name_with_a_folder_or_another_suffix_is_refused(tmp_path, capsys, name):
     assert main(changed(recorded_leg(tmp_path), scene=name)) == 2
     assert "--scene" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
@@ -133,15 +133,15 @@ def commands(meshes: tuple[str, str]) -> dict[str, list[str]]:
 @pytest.mark.parametrize("name", ["map.vtp", "grid.vtu", "check.html"])
 def test_a_command_replaces_its_own_file_alone(tmp_path, meshes, capsys, name):
     place, command = tmp_path / name, commands(meshes)[name]
-    mine = b"<VTKFile>somebody's mesh</VTKFile>"
-    place.write_bytes(mine)
+    foreign = b"<VTKFile>somebody's mesh</VTKFile>"
+    place.write_bytes(foreign)
     assert main([*command, f"--out={place}"]) == 2
     assert "tkamb did not write it" in capsys.readouterr().err
-    assert place.read_bytes() == mine
+    assert place.read_bytes() == foreign
     assert main([*command, f"--out={place}", "--force"]) == 0
     written = place.read_bytes()
-    assert written != mine
-    assert main([*command, f"--out={place}"]) == 0  # its own
+    assert written != foreign
+    assert main([*command, f"--out={place}"]) == 0  # The file is now tkamb's own.
 
 
 @pytest.mark.parametrize(
@@ -159,7 +159,7 @@ def test_a_command_replaces_its_own_file_alone(tmp_path, meshes, capsys, name):
         ("a.vtp", b"", True),
     ],
 )
-def test_whose_a_file_is(tmp_path, name, content, allowed):
+def test_only_files_of_tkamb_are_replaced(tmp_path, name, content, allowed):
     (tmp_path / name).write_bytes(content)
     if allowed:
         check_output_file(tmp_path / name)
@@ -170,7 +170,7 @@ def test_whose_a_file_is(tmp_path, name, content, allowed):
     check_output_file(tmp_path / "new.vtp")
 
 
-def test_a_folder_is_no_place_for_a_file(tmp_path):
+def test_a_folder_is_not_replaced_by_a_file(tmp_path):
     (tmp_path / "a.vtp").mkdir()
     with pytest.raises(InputError, match="is not a file"):
         check_output_file(tmp_path / "a.vtp", force=True)

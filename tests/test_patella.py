@@ -93,34 +93,46 @@ def knee_at(flexion_deg: float) -> Array:
 
 
 def three_force(flexion_deg: float, guess: Array) -> tuple[Array, float, float]:
-    """Return the closed-form coordinates, PL/Q and PF/Q of three concurrent forces."""
+    """Return coordinates (3,), PL/Q and PF/Q with which the three forces meet in one point."""
     tuberosity = transform(inverse(knee_at(flexion_deg)), TUBEROSITY)[:2]
 
-    def place(unknown: Array) -> tuple[Array, Array, Array, Array]:
+    def points_at(unknown: Array) -> tuple[Array, Array, Array, Array]:
         angle, rotation = unknown
-        out = np.array([np.cos(angle), np.sin(angle)])
-        turn = np.array(
+        radial = np.array([np.cos(angle), np.sin(angle)])
+        rotation_matrix = np.array(
             [[np.cos(rotation), -np.sin(rotation)], [np.sin(rotation), np.cos(rotation)]]
         )
-        at = (TROCHLEA + DOME) * out - turn @ CENTRE[:2]
-        return at, out, at + turn @ INSERTION[:2], at + turn @ PROXIMAL[:2]
+        position = (TROCHLEA + DOME) * radial - rotation_matrix @ CENTRE[:2]
+        return (
+            position,
+            radial,
+            position + rotation_matrix @ INSERTION[:2],
+            position + rotation_matrix @ PROXIMAL[:2],
+        )
 
     def errors(unknown: Array) -> list[float]:
-        _, out, insertion, proximal = place(unknown)
-        pull, hold = ORIGIN[:2] - insertion, tuberosity - proximal
-        meet = (
+        _, radial, insertion, proximal = points_at(unknown)
+        muscle, patellar = ORIGIN[:2] - insertion, tuberosity - proximal
+        intersection = (
             insertion
-            + pull * np.linalg.solve(np.column_stack([pull, -hold]), proximal - insertion)[0]
+            + muscle
+            * np.linalg.solve(np.column_stack([muscle, -patellar]), proximal - insertion)[0]
         )
-        return [100 * (np.linalg.norm(hold) - LENGTH), 100 * (meet[0] * out[1] - meet[1] * out[0])]
+        return [
+            100 * (np.linalg.norm(patellar) - LENGTH),
+            100 * (intersection[0] * radial[1] - intersection[1] * radial[0]),
+        ]
 
     at_guess = guess[:2] + CENTRE[:2]
     angle, rotation = fsolve(errors, [np.arctan2(at_guess[1], at_guess[0]), guess[2]], xtol=1e-13)
-    at, out, insertion, proximal = place(np.array([angle, rotation]))
-    pull, hold = ORIGIN[:2] - insertion, tuberosity - proximal
-    pull, hold = pull / np.linalg.norm(pull), hold / np.linalg.norm(hold)
-    ligament, normal = np.linalg.solve(np.column_stack([hold, out]), -pull)
-    return np.append(at, rotation), float(ligament), float(normal)
+    position, radial, insertion, proximal = points_at(np.array([angle, rotation]))
+    muscle, patellar = ORIGIN[:2] - insertion, tuberosity - proximal
+    muscle, patellar = (
+        muscle / np.linalg.norm(muscle),
+        patellar / np.linalg.norm(patellar),
+    )
+    ligament, normal = np.linalg.solve(np.column_stack([patellar, radial]), -muscle)
+    return np.append(position, rotation), float(ligament), float(normal)
 
 
 def solved(mechanism: ExtensorMechanism, angles: list[float]) -> list[PatellaState]:
@@ -143,12 +155,12 @@ def test_circular_trochlea_is_the_three_force_solution(mechanism: ExtensorMechan
         assert state.patellofemoral_ratio == pytest.approx(normal, rel=3e-3)
 
 
-def test_contact_moves_superior_on_the_patella(mechanism: ExtensorMechanism) -> None:
+def test_the_contact_moves_superior_on_the_patella(mechanism: ExtensorMechanism) -> None:
     height = [s.contact_on_patella[1] for s in solved(mechanism, [0.0, 10.0, 20.0, 30.0, 40.0])]
     assert (np.diff(height) > 0.0).all()
 
 
-def test_conditions_hold_and_guess_does_not_matter(mechanism: ExtensorMechanism) -> None:
+def test_the_solution_satisfies_the_conditions_from_any_guess(mechanism: ExtensorMechanism) -> None:
     cold = solve_patella(mechanism, knee_at(25.0))
     guess = cold.coordinates + np.array([1e-3, -1e-3, 0.05])
     warm = solve_patella(mechanism, knee_at(25.0), guess)
@@ -160,7 +172,7 @@ def test_conditions_hold_and_guess_does_not_matter(mechanism: ExtensorMechanism)
 
 
 def test_the_quadriceps_is_shortest_at_equilibrium(mechanism: ExtensorMechanism) -> None:
-    """By virtual work, a rotation with constant gap and ligament length lengthens the muscle."""
+    """By virtual work, rotation at constant gap and ligament length lengthens the muscle."""
     from tkamb.knee.patella_search import _Search
 
     state = solve_patella(mechanism, knee_at(25.0))
@@ -179,13 +191,13 @@ def test_the_quadriceps_is_shortest_at_equilibrium(mechanism: ExtensorMechanism)
 
 @pytest.mark.parametrize("aside", [-0.05, 0.05])
 def test_a_button_may_lie_anywhere_on_its_patella(aside: float) -> None:
-    """A button that is shifted along y, with the patella shifted back, has the same contact."""
+    """If the button shifts along y and the patella shifts back, the contact does not change."""
     plain = PatellofemoralContact(cylinder(), dome())
     moved = PatellofemoralContact(cylinder(), dome().moved(translation(0.0, aside)))
     at = np.array([TROCHLEA + DOME - 0.004, 0.0, 0.0])
-    here, there = plain.at(at), moved.at(at - [0.0, aside, 0.0])
-    assert there.gap == pytest.approx(here.gap, abs=1e-6)
-    assert there.normal == pytest.approx(here.normal, abs=1e-3)
+    plain_state, moved_state = plain.at(at), moved.at(at - [0.0, aside, 0.0])
+    assert moved_state.gap == pytest.approx(plain_state.gap, abs=1e-6)
+    assert moved_state.normal == pytest.approx(plain_state.normal, abs=1e-3)
 
 
 def test_the_shift_on_a_slope_is_the_yield_times_its_sine() -> None:
@@ -195,9 +207,9 @@ def test_the_shift_on_a_slope_is_the_yield_times_its_sine() -> None:
     wall.apply_translation([-0.01, 0.0, 0.0])
     wall.apply_transform(trimesh.transformations.rotation_matrix(-slope, [0, 1, 0]))
     contact = PatellofemoralContact(surface(wall, "wall"), dome(), lateral_yield=0.01)
-    found = contact.at(np.array([DOME / np.cos(slope) - CENTRE[0], 0.0, 0.0]))
-    assert found.shift == pytest.approx(0.01 * np.sin(slope), rel=1e-9)
-    assert found.normal == pytest.approx([1.0, 0.0, 0.0], abs=1e-12)
+    state = contact.at(np.array([DOME / np.cos(slope) - CENTRE[0], 0.0, 0.0]))
+    assert state.shift == pytest.approx(0.01 * np.sin(slope), rel=1e-9)
+    assert state.normal == pytest.approx([1.0, 0.0, 0.0], abs=1e-12)
 
 
 def test_the_point_lies_on_the_line_of_action_of_both_facets() -> None:
@@ -212,13 +224,13 @@ def test_the_point_lies_on_the_line_of_action_of_both_facets() -> None:
         walls.append(wall.apply_translation([0.0, rise, side]))
         caps.append(cap.apply_translation([0.0, rise, side]))
     femoral, button = (surface(trimesh.util.concatenate(m), "pair") for m in (walls, caps))
-    found = PatellofemoralContact(femoral, button).at(np.zeros(3))
-    share = np.array([found.share_left, 1.0 - found.share_left])
+    state = PatellofemoralContact(femoral, button).at(np.zeros(3))
+    share = np.array([state.share_left, 1.0 - state.share_left])
     assert share.min() > 0.05
     force = share @ np.stack([np.cos(turns), np.sin(turns)], axis=1)
     moment = -share @ (rises * np.cos(turns))
-    assert found.normal[:2] == pytest.approx(force / np.linalg.norm(force), abs=1e-9)
-    arm = found.point[0] * found.normal[1] - found.point[1] * found.normal[0]
+    assert state.normal[:2] == pytest.approx(force / np.linalg.norm(force), abs=1e-9)
+    arm = state.point[0] * state.normal[1] - state.point[1] * state.normal[0]
     assert arm == pytest.approx(moment / np.linalg.norm(force), abs=3e-5)
 
 
@@ -244,13 +256,13 @@ def test_gap_is_the_distance_of_the_closest_points() -> None:
 
 
 def test_a_prepared_contact_used_again_gives_the_same_result() -> None:
-    first, places = (
+    first, coordinates = (
         PatellofemoralContact(cylinder(), dome()),
         ([0.046, 0.0, 0.1], [0.04, 0.02, 0.0]),
     )
-    first.at(places[0])
-    again, new = first.unused().at(places[1]), PatellofemoralContact(cylinder(), dome())
-    fresh = new.at(places[1])
+    first.at(coordinates[0])
+    again, new = first.unused().at(coordinates[1]), PatellofemoralContact(cylinder(), dome())
+    fresh = new.at(coordinates[1])
     assert again.gap == fresh.gap
     np.testing.assert_array_equal(again.point, fresh.point)
     np.testing.assert_array_equal(again.normal, fresh.normal)
@@ -279,23 +291,23 @@ def test_groove_shares_the_force_and_never_jumps() -> None:
     shares, normals, bodies = [], [], (groove(), dome())
     for beside in np.linspace(-2e-3, 2e-3, 21):
         contact = PatellofemoralContact(*bodies, ml=float(beside))
-        found = contact.at(np.array([0.0368, 0.0, 0.0]))
-        shares.append(found.share_left)
-        normals.append(found.normal)
+        state = contact.at(np.array([0.0368, 0.0, 0.0]))
+        shares.append(state.share_left)
+        normals.append(state.normal)
     assert shares[10] == pytest.approx(0.5, abs=0.01)
     assert np.abs(np.diff(shares)).max() < 0.25
     assert np.abs(np.diff(normals, axis=0)).max() < 0.02
     assert (np.diff(shares) * (shares[-1] - shares[0]) >= -1e-6).all()
 
 
-def test_recorded_patella_keeps_its_gap(mechanism: ExtensorMechanism) -> None:
-    place = np.array([TROCHLEA + DOME - 0.004 + 1e-3, 0.0, 0.0])
-    state = patella_at(mechanism, knee_at(0.0), place, mechanism.contact.at(place))
+def test_a_recorded_patella_keeps_its_gap(mechanism: ExtensorMechanism) -> None:
+    coordinates = np.array([TROCHLEA + DOME - 0.004 + 1e-3, 0.0, 0.0])
+    state = patella_at(mechanism, knee_at(0.0), coordinates, mechanism.contact.at(coordinates))
     assert state.gap == pytest.approx(1e-3, abs=1e-5)
-    assert (state.coordinates == place).all()
+    assert (state.coordinates == coordinates).all()
 
 
-def test_ligament_too_short_to_reach_is_not_found(mechanism: ExtensorMechanism) -> None:
+def test_a_patella_whose_ligament_is_too_short_is_not_found(mechanism: ExtensorMechanism) -> None:
     short = ExtensorMechanism(**{**vars(mechanism), "ligament_length": 0.005})
     state = solve_patella(short, knee_at(20.0))
     assert state.status in (PatellaStatus.NO_CONTACT, PatellaStatus.LIGAMENT)
@@ -303,11 +315,11 @@ def test_ligament_too_short_to_reach_is_not_found(mechanism: ExtensorMechanism) 
     assert np.isnan(state.coordinates).all()
 
 
-def test_end_of_the_femoral_mesh_is_reported(mechanism: ExtensorMechanism) -> None:
+def test_a_contact_on_the_end_of_the_femoral_mesh_is_reported(mechanism: ExtensorMechanism) -> None:
     """The trochlea ends at y = -5 mm. Contact below this end is on the edge of the mesh."""
-    whole = cylinder()
-    kept = whole.faces[(whole.triangles[:, :, 1] > -5e-3).all(axis=1)]
-    contact = PatellofemoralContact(Surface(whole.vertices, kept, "cut"), dome())
+    trochlea = cylinder()
+    faces = trochlea.faces[(trochlea.triangles[:, :, 1] > -5e-3).all(axis=1)]
+    contact = PatellofemoralContact(Surface(trochlea.vertices, faces, "cut"), dome())
     cut = ExtensorMechanism(**{**vars(mechanism), "contact": contact})
     states = [solve_patella(cut, knee_at(angle)) for angle in (0.0, 40.0)]
     assert states[0].status is PatellaStatus.OK
@@ -347,33 +359,33 @@ def test_shipped_contact_moves_superior_until_the_quadriceps_wraps(
 
 def test_shipped_patella_moves_smoothly(shipped: tuple[Array, list[PatellaState]]) -> None:
     """Second differences over 101 frames exceed 0.1 deg only at the kink where wrapping starts."""
-    places = np.array([state.coordinates for state in shipped[1]])
-    bend = np.abs(np.diff(places, n=2, axis=0)).max(axis=0)
+    coordinates = np.array([state.coordinates for state in shipped[1]])
+    bend = np.abs(np.diff(coordinates, n=2, axis=0)).max(axis=0)
     assert (bend[:2] < 2e-4).all()
     assert bend[2] < np.deg2rad(0.4)
 
 
 def test_a_patella_lost_from_a_distant_guess_is_found_from_its_own_frame():
-    """A coarse choice of frames finds the same patella as all frames."""
+    """The search for frame 0 fails from the last frame and converges from frame 0."""
     starter = Path(starter_package.__file__).parent / "files" / "scene.toml"
     mechanics = mechanics_of(load_case(load_scene(starter)))
     extensor, pose = mechanics.extensor, mechanics.poses[0]
-    own, far = extensor.states[0], extensor.states[-1]
-    lost = solve_patella(extensor.lines.mechanism, pose, far.coordinates, far.slopes)
+    frame_state, last_state = extensor.states[0], extensor.states[-1]
+    lost = solve_patella(extensor.lines.mechanism, pose, last_state.coordinates, last_state.slopes)
     assert not lost.status.found
-    found = extensor.patella(0, pose, far)
-    assert found.status.found
-    np.testing.assert_allclose(found.coordinates, own.coordinates, atol=1e-6)
+    state = extensor.patella(0, pose, last_state)
+    assert state.status.found
+    np.testing.assert_allclose(state.coordinates, frame_state.coordinates, atol=1e-6)
 
 
 def test_a_recorded_contact_does_not_depend_on_earlier_evaluations(
     mechanism: ExtensorMechanism,
 ) -> None:
-    """A part of a motion has exactly the results of the whole motion."""
-    places = [np.array([0.05 + 1e-4 * k, 1e-3 * k, 0.02 * k]) for k in range(8)]
+    """A part of a motion therefore has exactly the results of the complete motion."""
+    coordinates = [np.array([0.05 + 1e-4 * k, 1e-3 * k, 0.02 * k]) for k in range(8)]
     contact = mechanism.contact.unused()
-    after_others = [contact.at(place) for place in places][-1]
-    alone = mechanism.contact.unused().at(places[-1])
+    after_others = [contact.at(row) for row in coordinates][-1]
+    alone = mechanism.contact.unused().at(coordinates[-1])
     assert vars(alone).keys() == vars(after_others).keys()
     for name, value in vars(alone).items():
         np.testing.assert_array_equal(vars(after_others)[name], value)

@@ -36,8 +36,7 @@ def turned_about_y(point):
 
 
 def test_attachments_on_a_link_that_is_turned_on_the_patella_stay_where_they_are(plain, tmp_path):
-    """A link rotated by 180 deg about y, with the same points in its axes, gives the same
-    results."""
+    """Points in the axes of a link that is rotated by 180 deg about y give the same results."""
     points = {
         "quadriceps__insertion": [8.0, 20.0, 0.0],
         "patellar_ligament__proximal": [6.0, -21.0, 0.0],
@@ -67,24 +66,25 @@ def test_attachments_on_a_link_that_is_turned_on_the_patella_stay_where_they_are
 
 @pytest.mark.parametrize("move", [0.02, 0.3, 3.0, 40.0])
 def test_slopes_of_a_similar_pose_only_shorten_the_search(mechanism, move):  # noqa: F811
-    """From a degree away the search needs fewer evaluations; from 40 deg away it searches all
-    rotations."""
+    """Less than a degree away the search needs fewer evaluations. The result is always the same."""
     near = solve_patella(
         mechanism, knee_at(20.0), solve_patella(mechanism, knee_at(19.0)).coordinates
     )
     assert near.slopes is not None
-    pose, looks = knee_at(20.0 + move), []
+    pose, evaluations = knee_at(20.0 + move), []
     counted = ExtensorMechanism(**vars(mechanism))
-    look = counted.contact.at
+    evaluate = counted.contact.at
     object.__setattr__(counted, "contact", counted.contact.unused())
-    counted.contact.at = lambda place: looks.append(place) or look(place)
+    counted.contact.at = lambda coordinates: (
+        evaluations.append(coordinates) or evaluate(coordinates)
+    )
     slow = solve_patella(counted, pose, near.coordinates)
-    asked = len(looks)
+    slow_evaluations = len(evaluations)
     quick = solve_patella(counted, pose, near.coordinates, near.slopes)
     assert quick.coordinates == pytest.approx(slow.coordinates, abs=2e-7)
     assert quick.patellofemoral_ratio == pytest.approx(slow.patellofemoral_ratio, abs=1e-6)
     if move < 1.0:
-        assert len(looks) - asked <= 0.6 * asked
+        assert len(evaluations) - slow_evaluations <= 0.6 * slow_evaluations
 
 
 @pytest.mark.parametrize("wild", [[0.0, 0.0, 2.5], [0.045, 0.3, -3.0]])
@@ -97,8 +97,7 @@ def test_a_wrong_guess_does_not_lose_the_patella(mechanism, wild):  # noqa: F811
 
 
 def test_a_guess_inside_the_outline_of_the_femur_does_not_lose_the_patella(mechanism):  # noqa: F811
-    """At the guess an end of the quadriceps lies inside its outline; the full search finds the
-    place."""
+    """At the guess an end of the quadriceps lies inside the outline; a full search converges."""
     angle = np.linspace(0.0, 2 * np.pi, 181)[:-1]
     outline = 0.026 * np.column_stack([np.cos(angle), np.sin(angle)])
     wrapped = ExtensorMechanism(**{**vars(mechanism), "femoral_outline": outline})
@@ -123,16 +122,16 @@ def test_the_condition_that_fails_is_named(mechanism, change, conditions):  # no
 
 
 def test_a_frame_that_loses_the_patella_fails_and_the_run_goes_on(plain, monkeypatch):
-    """The status of lost frame 5 names reason and flexion. The adjacent frames change little."""
+    """The status of lost frame 5 states reason and flexion. The other frames change little."""
     scene = load_scene(MODEL / "scene.toml", FEW | {"contact.model": "foundation"})
-    seen = []
+    poses = []
 
     def losing(parts, pose, *near):
-        seen.append(pose)
-        found = solve_patella(parts, pose, *near)
-        if len(seen) != 6:
-            return found
-        return replace(found, coordinates=np.full(3, np.nan), status=PatellaStatus.MOMENT)
+        poses.append(pose)
+        state = solve_patella(parts, pose, *near)
+        if len(poses) != 6:
+            return state
+        return replace(state, coordinates=np.full(3, np.nan), status=PatellaStatus.MOMENT)
 
     monkeypatch.setattr(extensor, "solve_patella", losing)
     results = simulate(scene)
@@ -146,8 +145,8 @@ def test_a_frame_that_loses_the_patella_fails_and_the_run_goes_on(plain, monkeyp
     assert np.allclose(results["quadriceps_N"][others], quadriceps, atol=0.5)
 
 
-def test_a_sample_starts_from_the_nominal_patella_and_keeps_its_rates(plain):
-    """At equal poses the result is equal. At other poses it is that of a full search."""
+def test_a_sample_searches_from_the_nominal_patella_and_keeps_its_rates(plain):
+    """At equal poses the result is equal. At other poses a full search gives the same result."""
     frames = plain.extensor
     same = frames.moved(frames.lines, plain.poses, range(2, 5))
     for k in range(11):
@@ -164,14 +163,13 @@ def test_a_sample_starts_from_the_nominal_patella_and_keeps_its_rates(plain):
     np.testing.assert_array_equal(moved.joints(6), frames.joints(6))
 
 
-def test_a_sample_searches_a_solved_patella_from_the_nominal_one(plain):
-    """A recorded patella does not change."""
-    known = SharedState(None, None, SimpleNamespace(moved=lambda *_: "moved"), range(1))
+def test_a_sample_searches_a_solved_patella_and_keeps_a_recorded_one(plain):
+    shared = SharedState(None, None, SimpleNamespace(moved=lambda *_: "moved"), range(1))
     case = load_case(load_scene(MODEL / "scene.toml", FEW))
-    assert _extensor_frames(case, plain.knee, plain.poses, known) == "moved"
+    assert _extensor_frames(case, plain.knee, plain.poses, shared) == "moved"
     patella = case.scene.patella.model_copy(update={"motion": "recorded"})
     scene = case.scene.model_copy(update={"patella": patella})
-    recorded = _extensor_frames(replace(case, scene=scene), plain.knee, plain.poses, known)
+    recorded = _extensor_frames(replace(case, scene=scene), plain.knee, plain.poses, shared)
     for k in (0, 10):
         np.testing.assert_array_equal(recorded.joints(k)[0], case.motion.patella[k])
 
@@ -213,10 +211,10 @@ def test_the_moments_of_three_forces_on_the_patella_add_up_to_zero(plain):
     for k in (3, 9):
         state, patella = plain.geometry(k).state, plain.extensor.states[k]
         muscle, ligament = plain.extensor.lines.paths(state)
-        hold = patella.ligament_ratio * ligament.start_direction
-        press = patella.patellofemoral_ratio * patella.contact_normal
+        ligament_force = patella.ligament_ratio * ligament.start_direction
+        contact_force = patella.patellofemoral_ratio * patella.contact_normal
         points = np.stack([muscle.points[-1], ligament.points[0], patella.contact_point])
-        forces = np.stack([-muscle.end_direction, hold, press])
+        forces = np.stack([-muscle.end_direction, ligament_force, contact_force])
         moments = np.cross(points - state.pose("femur")[:3, 3], forces) @ state.pose("femur")[:3, 2]
         assert np.abs(moments).min() > 1e-4
         assert moments.sum() == pytest.approx(0.0, abs=1e-6)

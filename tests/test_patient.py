@@ -37,12 +37,12 @@ def test_a_left_leg_gives_the_numbers_of_its_mirror_image(tmp_path):
         "patella": (0.1, "0.004 0.001 0.002", "2e-5 2.5e-5 3e-5 0 0 0"),
     }
     text = left(leg_urdf(plain))
-    own = Chain(text.replace('rpy="0.1 -0.2 0.3"', 'rpy="0 0 0"'), True)
-    mended = load_urdf(
+    left_leg = Chain(text.replace('rpy="0.1 -0.2 0.3"', 'rpy="0 0 0"'), True)
+    mirrored_urdf = load_urdf(
         table(tmp_path, text.replace('rpy="0.1 -0.2 0.3"', 'rpy="0 0 0"'), "left"), True
     )
-    turned = Chain(mended, True)
-    motion = random_motion(own, np.random.default_rng(0))
+    mirrored_leg = Chain(mirrored_urdf, True)
+    motion = random_motion(left_leg, np.random.default_rng(0))
     flip = np.diag([1.0, 1.0, -1.0, -1.0, -1.0, 1.0])
     joints = motion.joints.copy()
     joints[:, 2] *= -1.0  # knee_ml keeps its axis, so its coordinate changes sign
@@ -52,32 +52,35 @@ def test_a_left_leg_gives_the_numbers_of_its_mirror_image(tmp_path):
         flip @ motion.tibia_acceleration,
         joints,
     )
-    wanted, found = own.at(motion).inertial, turned.at(mirrored).inertial
-    wanted = wanted.copy()
-    wanted[:6] = flip @ wanted[:6]
-    wanted[8] *= -1.0
-    np.testing.assert_allclose(found, wanted, atol=1e-10)
+    expected, inertial = left_leg.at(motion).inertial, mirrored_leg.at(mirrored).inertial
+    expected = expected.copy()
+    expected[:6] = flip @ expected[:6]
+    expected[8] *= -1.0
+    np.testing.assert_allclose(inertial, expected, atol=1e-10)
     np.testing.assert_allclose(
-        turned.insert_in_tibia, mirrored_pose(own.insert_in_tibia), atol=1e-12
+        mirrored_leg.insert_in_tibia, mirrored_pose(left_leg.insert_in_tibia), atol=1e-12
     )
 
 
 def test_mirrored_inertia_is_the_reflected_tensor(tmp_path):
-    """I' = M I M about the reflected centre holds with a rotated inertial frame, too."""
-    own = Chain(left(leg_urdf()), True).model
-    mended = load_urdf(table(tmp_path, left(leg_urdf()), "left"), True)
-    turned = Chain(mended, True).model
+    """I' = M I M about the reflected centre, also with a rotated inertial frame."""
+    left_model = Chain(left(leg_urdf()), True).model
+    mirrored_urdf = load_urdf(table(tmp_path, left(leg_urdf()), "left"), True)
+    mirrored_model = Chain(mirrored_urdf, True).model
     for name in ("root_joint", "knee_flexion", "patella_rotation"):
-        a, b = own.inertias[own.getJointId(name)], turned.inertias[turned.getJointId(name)]
+        a, b = (
+            left_model.inertias[left_model.getJointId(name)],
+            mirrored_model.inertias[mirrored_model.getJointId(name)],
+        )
         np.testing.assert_allclose(b.lever, MIRROR @ a.lever, atol=1e-12)
         np.testing.assert_allclose(b.inertia, MIRROR @ a.inertia @ MIRROR, atol=1e-12)
 
 
-def test_a_right_leg_is_not_touched(tmp_path):
+def test_a_right_leg_does_not_change(tmp_path):
     urdf = load_urdf(table(tmp_path, leg_urdf()), True)
-    wanted = pin.buildModelFromXML(leg_urdf(), pin.JointModelFreeFlyer())
-    found = pin.buildModelFromXML(urdf, pin.JointModelFreeFlyer())
-    assert all(a.isApprox(b) for a, b in zip(wanted.inertias, found.inertias, strict=True))
+    expected = pin.buildModelFromXML(leg_urdf(), pin.JointModelFreeFlyer())
+    model = pin.buildModelFromXML(urdf, pin.JointModelFreeFlyer())
+    assert all(a.isApprox(b) for a, b in zip(expected.inertias, model.inertias, strict=True))
 
 
 def test_missing_inertials_come_from_de_leva(tmp_path):
@@ -92,7 +95,7 @@ def test_missing_inertials_come_from_de_leva(tmp_path):
     assert shank.mass == pytest.approx((0.0433 + 0.0137) * 75, rel=1e-12)
 
 
-def test_segment_inertia_is_that_of_its_radii():
+def test_the_inertia_of_a_segment_follows_from_its_radii_of_gyration():
     thigh = segment_inertia("thigh", "female", 60.0, np.array([0, 0.4, 0]), np.zeros(3))
     radii = np.sqrt(np.diag(thigh.tensor) / thigh.mass) / 0.4
     np.testing.assert_allclose(radii, [0.369, 0.162, 0.364], atol=1e-12)
@@ -118,12 +121,12 @@ def test_segment_inertia_is_that_of_its_radii():
     ],
 )
 def test_a_wrong_patient_is_refused_in_one_line(tmp_path, change, words):
-    with pytest.raises(InputError, match=words) as caught:
+    with pytest.raises(InputError, match=words) as refused:
         load_urdf(table(tmp_path, change(leg_urdf())), True)
-    assert "\n" not in str(caught.value)
+    assert "\n" not in str(refused.value)
 
 
-def test_missing_sex_is_asked_for(tmp_path):
+def test_without_inertias_the_sex_is_required(tmp_path):
     with pytest.raises(InputError, match="sex"):
         load_urdf(table(tmp_path, leg_urdf({"patella": INERTIA["patella"]})), True)
 

@@ -28,7 +28,7 @@ def scene_file(tmp_path):
     return write_scene(tmp_path / "scene")
 
 
-def test_the_source_is_laid_over_a_scene(scene_file):
+def test_a_preset_changes_the_scene(scene_file):
     scene = load_scene(scene_file, preset=SOURCE)
     contact = scene.contact
     assert (contact.model, contact.resolution_mm) == ("lattice-source", 1.5)
@@ -41,17 +41,17 @@ def test_the_source_is_laid_over_a_scene(scene_file):
     assert load_scene(scene_file).preset is None
 
 
-def test_what_it_changed_is_told_and_what_it_did_not_is_not(scene_file):
-    found = load_scene(scene_file, preset=SOURCE).preset.as_dict()
-    changes = {one["key"]: (one["before"], one["after"]) for one in found["changes"]}
+def test_only_changed_keys_are_reported(scene_file):
+    preset = load_scene(scene_file, preset=SOURCE).preset.as_dict()
+    changes = {entry["key"]: (entry["before"], entry["after"]) for entry in preset["changes"]}
     assert changes["ground_reaction.applied"] == ("cop", "ankle")
     assert changes["contact.adjust"] == (None, True)
     for same in ("contact.friction", "contact.material", "contact.post", "muscles"):
         assert same not in changes
-    assert found["overridden"] == found["departures"] == []
+    assert preset["overridden"] == preset["departures"] == []
 
 
-def test_set_overrides_it(scene_file):
+def test_overrides_replace_values_of_the_preset(scene_file):
     scene = load_scene(
         scene_file, {"contact.adjust": False, "contact.options.law": "linear"}, SOURCE
     )
@@ -68,8 +68,7 @@ def test_another_contact_model_does_not_get_the_lattices_options(scene_file):
     assert set(scene.preset.overridden) == {"contact.model", "contact.options"}
 
 
-def test_a_scene_that_is_read_already_takes_it_too(scene_file):
-    """The scene is the same as from the file, and keeps its own overrides."""
+def test_a_preset_can_be_applied_to_a_loaded_scene(scene_file):
     read = load_scene(scene_file, FAST)
     assert with_preset(read, SOURCE) == load_scene(scene_file, FAST, SOURCE)
     assert with_preset(read, SOURCE).preset == load_scene(scene_file, FAST, SOURCE).preset
@@ -85,7 +84,7 @@ def test_a_scene_that_is_read_already_takes_it_too(scene_file):
         (("quadriceps", "patellar_ligament", "patella"), r"needs \[quadriceps\]"),
     ],
 )
-def test_what_the_scene_lacks_is_one_line(drop, words, capsys, tmp_path):
+def test_missing_data_are_a_one_line_error(drop, words, capsys, tmp_path):
     scene_file = write_scene(tmp_path / "scene", drop)
     with pytest.raises(InputError, match=words):
         load_scene(scene_file, preset=SOURCE)
@@ -95,21 +94,21 @@ def test_what_the_scene_lacks_is_one_line(drop, words, capsys, tmp_path):
     assert not out.exists()
 
 
-def test_skin_markers_do_not_give_what_fluoroscopy_does():
+def test_skin_markers_lack_the_required_pose():
     content = {"motion": {"interpretation": "markers"}, "tibia": {"kind": "sagittal"}}
     with pytest.raises(InputError, match="recorded pose on the insert"):
         find_preset(SOURCE).apply(content, {}, "scene.toml")
 
 
-def test_what_the_scene_does_otherwise_is_told():
+def test_remaining_differences_are_reported():
     content = {"tibia": {"kind": "pose"}, "ligament": [{"law": "quadratic-toe"}]}
-    told = find_preset(SOURCE).departures(content)
-    assert len(told) == 2
-    assert "in 3D" in told[0]
-    assert "quadratic-toe" in told[1]
+    departures = find_preset(SOURCE).departures(content)
+    assert len(departures) == 2
+    assert "in 3D" in departures[0]
+    assert "quadratic-toe" in departures[1]
 
 
-def test_a_run_records_it_in_summary_and_report(scene_file, tmp_path):
+def test_a_run_records_the_preset_in_summary_and_report(scene_file, tmp_path):
     out = tmp_path / "out"
     run = ["run", str(scene_file), "--as", SOURCE, "--contact", "hertz", "--frames", "5:6"]
     assert main([*run, "--set", "motion.frames=11", "--out", str(out)]) == 0
@@ -121,18 +120,18 @@ def test_a_run_records_it_in_summary_and_report(scene_file, tmp_path):
     assert "ground_reaction.applied = ankle (scene: cop)" in report
 
 
-def test_the_same_from_python_and_from_the_command_line(scene_file):
+def test_simulate_and_load_scene_apply_a_preset_alike(scene_file):
     read = load_scene(scene_file, FAST)
-    found = simulate(read, preset=SOURCE, frames=slice(5, 6))
+    results = simulate(read, preset=SOURCE, frames=slice(5, 6))
     same = simulate(load_scene(scene_file, FAST, SOURCE), frames=slice(5, 6))
-    assert found["force_total_N"] == same["force_total_N"]
-    assert found.summary["preset"] == same.summary["preset"]
-    assert found["force_total_N"] != simulate(read, frames=slice(5, 6))["force_total_N"]
-    assert "Run as" in report_html(found)
+    assert results["force_total_N"] == same["force_total_N"]
+    assert results.summary["preset"] == same.summary["preset"]
+    assert results["force_total_N"] != simulate(read, frames=slice(5, 6))["force_total_N"]
+    assert "Run as" in report_html(results)
 
 
-def test_the_scene_of_such_results_is_read_as_they_were_run(scene_file, tmp_path):
-    """`view` and `export --deck` read the scene again; `run_again` is the command for that run."""
+def test_the_scene_of_results_is_read_again_with_its_preset(scene_file, tmp_path):
+    """`view` and `export --deck` read the scene again. `run_again` returns the run's command."""
     out = tmp_path / "out"
     run = ["run", str(scene_file), "--as", SOURCE, "--contact", "hertz", "--frames", "5:6"]
     assert main([*run, "--set", "motion.frames=11", "--out", str(out)]) == 0
@@ -140,8 +139,8 @@ def test_the_scene_of_such_results_is_read_as_they_were_run(scene_file, tmp_path
     case = case_of_results(results)
     assert case.scene.motion.motion == "roll-slip"
     assert case.scene.contact.adjust
-    again = run_again(results.summary)
-    assert f"{scene_file} --as {SOURCE} --set" in again
+    command = run_again(results.summary)
+    assert f"{scene_file} --as {SOURCE} --set" in command
 
 
 class MyStudy(Preset):
@@ -150,7 +149,7 @@ class MyStudy(Preset):
     settings = {"contact.friction": 0.1}  # noqa: RUF012
 
 
-def test_another_package_can_offer_one(scene_file, monkeypatch):
+def test_another_package_can_offer_a_preset(scene_file, monkeypatch):
     points = [EntryPoint("my-study", f"{__name__}:MyStudy", "tkamb.io.presets")]
     monkeypatch.setitem(sys.modules, __name__, SimpleNamespace(MyStudy=MyStudy))
     monkeypatch.setattr(named_classes, "entry_points", lambda group: points)
@@ -158,6 +157,6 @@ def test_another_package_can_offer_one(scene_file, monkeypatch):
     assert load_scene(scene_file, preset="my-study").contact.friction == 0.1
 
 
-def test_an_unknown_name_lists_the_known_ones(scene_file):
+def test_an_unknown_preset_is_refused_with_the_nearest_name(scene_file):
     with pytest.raises(InputError, match="did you mean sharma-2008"):
         load_scene(scene_file, preset="sharma-2007")

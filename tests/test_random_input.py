@@ -41,12 +41,12 @@ VALUES = st.recursive(
 
 def paths_of(content, above=()):
     """Return the path to every key of nested tables."""
-    found = []
+    paths = []
     for key, value in content.items():
-        found.append((*above, key))
+        paths.append((*above, key))
         if isinstance(value, dict):
-            found += paths_of(value, (*above, key))
-    return found
+            paths += paths_of(value, (*above, key))
+    return paths
 
 
 PATHS = sorted(paths_of(SCENE))
@@ -70,11 +70,11 @@ def run_cleanly(folder, capsys, *more):
     status = main(
         ["run", str(folder / "scene.toml"), "--out", str(out), "--frames", "0:101:50", *more]
     )
-    said = capsys.readouterr().err
+    output = capsys.readouterr().err
     assert status in (0, 1, 2)
-    assert "Traceback" not in said
+    assert "Traceback" not in output
     if status == 2:
-        assert len([line for line in said.splitlines() if line.startswith("tkamb: ")]) == 1
+        assert len([line for line in output.splitlines() if line.startswith("tkamb: ")]) == 1
         assert not (out / "results.csv").exists()
     return status
 
@@ -98,8 +98,8 @@ def test_a_scene_with_a_random_key_is_read_or_refused(path, value):
             tomllib.loads(file.read_text(encoding="utf-8"))
         except (tomllib.TOMLDecodeError, UnicodeError):
             return
-        said = refusal(file)
-        assert "\n" not in said
+        output = refusal(file)
+        assert "\n" not in output
 
 
 @settings(GENTLE, max_examples=60)
@@ -158,9 +158,9 @@ def test_a_press_of_random_meshes(capsys, name, how, seed):
         damage(folder / name, how, np.random.default_rng(seed))
         files = [str(folder / part) for part in ("femoral_component.stl", "insert.stl")]
         status = main(["press", *files, "--load", "800", "--resolution", "3", "--json"])
-        said = capsys.readouterr().err
+        output = capsys.readouterr().err
         assert status in (0, 1, 2)
-        assert "Traceback" not in said
+        assert "Traceback" not in output
 
 
 def damage(path, how, rng):
@@ -203,6 +203,6 @@ def test_a_press_with_random_numbers(capsys, load, pose, resolution):
         status = main(["press", *files, *options])
     except SystemExit as refused:
         status = refused.code
-    said = capsys.readouterr().err
+    output = capsys.readouterr().err
     assert status in (0, 1, 2)
-    assert "Traceback" not in said
+    assert "Traceback" not in output

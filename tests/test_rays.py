@@ -59,9 +59,9 @@ def test_first_agrees_with_all_triangles_in_double_precision(far):
     distance, face = surface.rays.first(origins, direction)
     expected = brute(surface, origins, direction)
     assert ((face >= 0) == np.isfinite(expected)).mean() > 0.99
-    both = (face >= 0) & np.isfinite(expected)
-    assert both.sum() > 50
-    np.testing.assert_allclose(distance[both], expected[both], atol=1e-13 * (1 + far))
+    common = (face >= 0) & np.isfinite(expected)
+    assert common.sum() > 50
+    np.testing.assert_allclose(distance[common], expected[common], atol=1e-13 * (1 + far))
 
 
 def test_hits_lie_in_the_plane_of_their_triangle():
@@ -73,8 +73,8 @@ def test_hits_lie_in_the_plane_of_their_triangle():
     distance, face = surface.rays.first(origins, DOWN)
     assert (face >= 0).all()
     hit = origins + distance[:, None] * DOWN
-    off = np.einsum("ij,ij->i", hit - surface.triangles[face, 0], surface.face_normals[face])
-    assert np.abs(off).max() < 1e-15
+    offset = np.einsum("ij,ij->i", hit - surface.triangles[face, 0], surface.face_normals[face])
+    assert np.abs(offset).max() < 1e-15
 
 
 def test_rays_through_vertices_and_edges_meet_the_surface():
@@ -104,7 +104,7 @@ def test_all_crossings_appear_once_and_sorted():
     assert (up[:, 1] < 0).all()
 
 
-def test_directions_per_ray_through_the_centre_of_a_sphere():
+def test_rays_through_the_centre_of_a_sphere_cross_it_twice():
     ball = sphere(0.02, 5)
     rng = np.random.default_rng(3)
     directions = rng.normal(size=(500, 3))
@@ -114,7 +114,7 @@ def test_directions_per_ray_through_the_centre_of_a_sphere():
     assert np.abs(distance.reshape(-1, 2) - [0.03, 0.07]).max() < 2e-5
 
 
-def test_origin_inside_and_on_the_surface():
+def test_rays_from_inside_and_on_the_surface_have_exact_distances():
     ball = sphere(0.02, 4)
     caster = ball.rays
     inside, _ = caster.first([[0.0, 0.0, 0.0]], DOWN)
@@ -169,7 +169,7 @@ def test_a_surface_computes_rays_and_normals_once_and_does_not_pickle_them():
     ball = sphere(0.02, 3, (0.0, 0.0, 0.0))
     assert ball.rays is ball.rays and ball.nearest is ball.nearest
     assert ball.corner_normals is ball.corner_normals
-    sent = pickle.loads(pickle.dumps(ball))
-    assert set(vars(sent)) == {"vertices", "faces", "name", "merged"}
+    copied = pickle.loads(pickle.dumps(ball))
+    assert set(vars(copied)) == {"vertices", "faces", "name", "merged"}
     origins, up = np.array([[0.0, -1.0, 0.0]]), (0.0, 1.0, 0.0)
-    assert sent.rays.first(origins, up)[0] == ball.rays.first(origins, up)[0]
+    assert copied.rays.first(origins, up)[0] == ball.rays.first(origins, up)[0]

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from joints import demand, dished_joint, push
+from joints import dished_joint, joint_equations, push
 from jw_gait import JW, needs_jw
 from mirrored_patient import write_mirrored_patient
 from scenes import MODEL, write_scene
@@ -44,10 +44,10 @@ def side_with_flexors(scene, left=False):
 
 def computed(side):
     """Return body and contact of a few frames, each with the previous frame as initial guess."""
-    found = []
+    results = []
     for k in FRAMES:
-        found.append(side.frame(k, [contact for _, contact in found]))
-    return found
+        results.append(side.frame(k, [contact for _, contact in results]))
+    return results
 
 
 @pytest.fixture(scope="module")
@@ -56,13 +56,13 @@ def side():
 
 
 @pytest.fixture(scope="module")
-def resting(side):
+def equilibria(side):
     return computed(side)
 
 
-def test_the_shank_is_in_equilibrium_with_muscles(side, resting):
+def test_the_shank_is_in_equilibrium_with_muscles(side, equilibria):
     """The loads are ground, weight, inertia, ligaments, muscles, contact and residuals."""
-    for body, _ in resting:
+    for body, _ in equilibria:
         geometry, values = body.geometry, body.loads.values
         assert geometry.share.force[1:].min() > 15.0
         loads = [*geometry.ligaments, *geometry.share.loads(geometry.state)]
@@ -75,18 +75,16 @@ def test_the_shank_is_in_equilibrium_with_muscles(side, resting):
             force = -values[f"{name}_normal"] * condyle.direction(side.mechanics.friction)
             total = total + push(force, condyle.point)
             points.append(condyle.point)
-        left = np.array([values["residual_ap"], 0.0, values["residual_ml"]])
-        total = total + push(left, np.mean(points, axis=0))
+        residual = np.array([values["residual_ap"], 0.0, values["residual_ml"]])
+        total = total + push(residual, np.mean(points, axis=0))
         total[4] += values["residual_axial"]
         scale = np.linalg.norm(body.loads.contact_force)
         np.testing.assert_allclose(total, 0.0, atol=1e-8 * scale)
 
 
-def test_the_muscle_forces_satisfy_the_equations_of_the_released_knee(resting):
-    """Static optimisation and equations give the same quadriceps tension to 1 N. Residuals of
-    released coordinates are zero.
-    """
-    for body, contact in resting:
+def test_the_muscle_forces_satisfy_the_equations_of_the_released_knee(equilibria):
+    """Static optimisation and equations give the same quadriceps tension to 1 N."""
+    for body, contact in equilibria:
         quadriceps = body.geometry.extensor.tension(body.loads.values)
         assert quadriceps == pytest.approx(body.geometry.share.force[0], abs=1.0)
         assert quadriceps > 500.0
@@ -95,32 +93,34 @@ def test_the_muscle_forces_satisfy_the_equations_of_the_released_knee(resting):
             assert abs(body.loads.values[name]) < 0.2
 
 
-def test_the_result_does_not_depend_on_the_initial_guess(side, resting):
-    """The last frame alone has the same pose within the tolerance, and the same muscles to 0.1 N.
+def test_the_result_does_not_depend_on_the_initial_guess(side, equilibria):
+    """Alone and after other frames, a frame has the same pose and the same muscle forces to 0.1 N.
 
     The compliance of an early pass would change a muscle force of 52 N by 8 N.
     """
-    (body, contact), (series, there) = side.frame(FRAMES[-1]), resting[-1]
-    away = (contact.equilibrium.coordinates - there.equilibrium.coordinates) * SCALE
-    assert np.abs(away).max() < 2e-6
+    (body, contact), (series, series_contact) = side.frame(FRAMES[-1]), equilibria[-1]
+    difference = (contact.equilibrium.coordinates - series_contact.equilibrium.coordinates) * SCALE
+    assert np.abs(difference).max() < 2e-6
     np.testing.assert_allclose(body.geometry.share.force, series.geometry.share.force, atol=0.1)
     force = series.loads.contact_force
     np.testing.assert_allclose(body.loads.contact_force, force, atol=2e-4 * np.linalg.norm(force))
 
 
-def test_activations_are_continuous(resting):
-    activations = np.array([body.geometry.share.activation for body, _ in resting])
+def test_activations_are_continuous(equilibria):
+    activations = np.array([body.geometry.share.activation for body, _ in equilibria])
     assert np.abs(np.diff(activations, axis=0)).max() < 0.05
 
 
-def test_a_left_leg_with_muscles_gives_the_mirrored_result(tmp_path, resting):
+def test_a_left_leg_with_muscles_gives_the_mirrored_result(tmp_path, equilibria):
     mirrored = side_with_flexors(write_mirrored_patient(tmp_path), left=True)
     body, contact = mirrored.frame(FRAMES[0])
-    same, there = resting[0]
-    np.testing.assert_allclose(body.geometry.share.force, same.geometry.share.force, atol=1e-5)
-    np.testing.assert_allclose(body.loads.contact_force, same.loads.contact_force, atol=1e-4)
-    here = contact.equilibrium.coordinates
-    np.testing.assert_allclose(here, there.equilibrium.coordinates, atol=1e-9)
+    right_body, right_contact = equilibria[0]
+    np.testing.assert_allclose(
+        body.geometry.share.force, right_body.geometry.share.force, atol=1e-5
+    )
+    np.testing.assert_allclose(body.loads.contact_force, right_body.loads.contact_force, atol=1e-4)
+    coordinates = contact.equilibrium.coordinates
+    np.testing.assert_allclose(coordinates, right_contact.equilibrium.coordinates, atol=1e-9)
 
 
 def test_the_tension_per_wrench_is_that_of_a_second_search():
@@ -130,67 +130,79 @@ def test_the_tension_per_wrench_is_that_of_a_second_search():
     start[1] = state.pair.first_touch_height(np.eye(4)) - 5e-5
     load = push((20.0, 900.0, 5.0), (0.003, 0.0, 0.004))
 
-    def rest(external, place):
-        joint = demand(external)
-        forces = ReleasedForces(joint, model.probe(state), place)
+    def equilibrium(external, coordinates):
+        joint = joint_equations(external)
+        forces = ReleasedForces(joint, model.probe(state), coordinates)
         balance = forces.balance()
         contact = forces.contact(balance)
-        place = forces.at(balance)
-        return place, contact, float(joint.reactions(place, contact.wrench)[-1])
+        coordinates = forces.at(balance)
+        return coordinates, contact, float(joint.reactions(coordinates, contact.wrench)[-1])
 
-    place, contact, kept = rest(load, start)
-    forces = ReleasedForces(demand(load), model.probe(state), place)
-    gain = forces.tension_per_wrench(contact)
-    assert forces.tension_at_rest(contact, gain) == pytest.approx(kept, rel=1e-4)
-    more = push((1.0, 20.0, 0.5), (0.004, 0.01, -0.01))
-    change = rest(load + more, place)[2] - kept
-    rigid = demand(more).reactions(place, np.zeros(6))[-1]
-    assert gain @ more == pytest.approx(change, rel=0.01)
+    coordinates, contact, tension = equilibrium(load, start)
+    forces = ReleasedForces(joint_equations(load), model.probe(state), coordinates)
+    compliance = forces.tension_per_wrench(contact)
+    assert forces.tension_in_equilibrium(contact, compliance) == pytest.approx(tension, rel=1e-4)
+    added = push((1.0, 20.0, 0.5), (0.004, 0.01, -0.01))
+    change = equilibrium(load + added, coordinates)[2] - tension
+    rigid = joint_equations(added).reactions(coordinates, np.zeros(6))[-1]
+    assert compliance @ added == pytest.approx(change, rel=0.01)
     assert abs(rigid - change) > 0.05 * abs(change)
     # near equilibrium: the residual is treated as an additional wrench
-    off = ReleasedForces(demand(load + more), model.probe(state), place)
-    assert off.tension_at_rest(contact, gain) == pytest.approx(kept + change, rel=1e-3)
+    away = ReleasedForces(joint_equations(load + added), model.probe(state), coordinates)
+    assert away.tension_in_equilibrium(contact, compliance) == pytest.approx(
+        tension + change, rel=1e-3
+    )
 
 
 def share_of(force):
-    one, none = np.array([force]), np.zeros((0, 3))
+    value, no_lines = np.array([force]), np.zeros((0, 3))
     return MuscleShare(
-        ("a",), one, one, ("knee",), one, one, 0, np.zeros(0, int), CrossingLines(none, none)
+        ("a",),
+        value,
+        value,
+        ("knee",),
+        value,
+        value,
+        0,
+        np.zeros(0, int),
+        CrossingLines(no_lines, no_lines),
     )
 
 
 @pytest.mark.parametrize("slope", [0.2, -0.3, -1.0, -4.0])
 def test_relaxation_converges_where_plain_iteration_diverges(slope):
     """With f' = 100 + slope f and a slope below -1, plain iteration diverges."""
-    mixing = Relaxation()
-    held = mixing.mixed(share_of(0.0))
+    relaxation = Relaxation()
+    applied = relaxation.relaxed_forces(share_of(0.0))
     for _ in range(6):
-        held = mixing.mixed(share_of(100.0 + slope * held.force[0]))
-        if mixing.settled:
+        applied = relaxation.relaxed_forces(share_of(100.0 + slope * applied.force[0]))
+        if relaxation.converged:
             break
-    assert mixing.settled
-    assert held.force[0] == pytest.approx(100.0 / (1.0 - slope), abs=4.0)
+    assert relaxation.converged
+    assert applied.force[0] == pytest.approx(100.0 / (1.0 - slope), abs=4.0)
 
 
 @pytest.mark.parametrize("steepness", [0.5, -0.9, -2.0])
 def test_the_compliance_converges_where_plain_iteration_oscillates(steepness):
     """With g' = 1 + steepness (g - 1) and a steepness below -1, plain iteration oscillates."""
-    mixing, held = Relaxation(), None
+    relaxation, compliance = Relaxation(), None
     for _ in range(10):
-        found = np.full(6, 3.0) if held is None else 1.0 + steepness * (held - 1.0)
-        held = mixing.yielding(found)
-    np.testing.assert_allclose(held, 1.0, atol=0.25)
-    assert mixing.doubt == pytest.approx(np.abs(found - held).max() / np.abs(held).max())
-    assert mixing.yielding(None) is None
-    assert mixing.doubt == 0.0
+        measured = np.full(6, 3.0) if compliance is None else 1.0 + steepness * (compliance - 1.0)
+        compliance = relaxation.compliance(measured)
+    np.testing.assert_allclose(compliance, 1.0, atol=0.25)
+    assert relaxation.compliance_error == pytest.approx(
+        np.abs(measured - compliance).max() / np.abs(compliance).max()
+    )
+    assert relaxation.compliance(None) is None
+    assert relaxation.compliance_error == 0.0
 
 
 def test_the_last_compliance_is_constant_and_its_difference_is_reported():
-    mixing, held = Relaxation(), None
+    relaxation, compliance = Relaxation(), None
     for k in range(20):
-        held = mixing.yielding(np.full(6, 1.0 if k % 2 else 2.0))
-    assert mixing.doubt > 0.1
-    np.testing.assert_array_equal(held, mixing.yielding(np.full(6, 9.0)))
+        compliance = relaxation.compliance(np.full(6, 1.0 if k % 2 else 2.0))
+    assert relaxation.compliance_error > 0.1
+    np.testing.assert_array_equal(compliance, relaxation.compliance(np.full(6, 9.0)))
 
 
 @pytest.mark.slow
@@ -230,14 +242,14 @@ def test_activations_in_gait_are_continuous_at_100_Hz():
 def test_all_results_of_a_left_leg_equal_those_of_the_right_leg(tmp_path, monkeypatch):
     """Mirrored files give the same columns and the same map."""
 
-    def given(case):
+    def muscles_of(case):
         left = case.scene.patient.side == "left"
         trial = two_flexors(len(case.motion.time), least=0.02)
         if left:
             trial = replace(trial, shank=trial.shank @ MIRROR, thigh=trial.thigh @ MIRROR)
         return SharedMuscles(trial, left)
 
-    monkeypatch.setattr("tkamb.run.muscles.shared_muscles.load_muscles", given)
+    monkeypatch.setattr("tkamb.run.muscles.shared_muscles.load_muscles", muscles_of)
     settings = CONTACT | {
         "muscles.model": "patient.urdf"
     }  # the reader of this key is replaced here

@@ -158,6 +158,11 @@ def test_curves_are_interrupted_where_a_new_cycle_begins(gait):
     assert np.isnan(y[30])
 
 
+def test_a_single_frame_is_at_0_per_cent_of_the_cycle(gait):
+    results = Results({name: values[:1] for name, values in gait.columns.items()}, {}, None)
+    assert horizontal_axis(results, "cycle").values == pytest.approx([0.0])
+
+
 def test_frames_of_the_table_are_at_round_steps():
     assert [round_step(v) for v in (0.09, 10, 10.1, 17, 31, 60)] == [0.1, 10, 15, 20, 50, 100]
     axis = horizontal_axis(make_run("bend", maps=False))

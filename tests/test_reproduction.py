@@ -1,4 +1,4 @@
-"""The page on the dissertation has the printed numbers and names existing objects."""
+"""The page on the dissertation has the printed numbers and names existing files and tests."""
 
 import ast
 import json
@@ -37,8 +37,8 @@ def test_an_element_of_chapter_4_is_where_the_page_says(row):
 
 
 def test_every_element_has_a_section_of_chapter_4_and_every_section_an_element():
-    told = {row["section"] for row in facts()["element"]}
-    assert told == {"4.1", "4.2", "4.3", "4.4", *(f"4.5.{k}" for k in range(1, 7))}
+    sections = {row["section"] for row in facts()["element"]}
+    assert sections == {"4.1", "4.2", "4.3", "4.4", *(f"4.5.{k}" for k in range(1, 7))}
 
 
 PRINTED = {
@@ -52,15 +52,15 @@ PRINTED = {
     "5.2.6": "15 5",
     "5.2.7": "32 3.6 1.8 56",
 }
-"""The numbers that chapter 5 prints, by section."""
+"""Section of chapter 5 -> the numbers printed in it."""
 
 
 @pytest.mark.parametrize("section", PRINTED)
 def test_every_number_of_chapter_5_stands_in_the_table(section):
     rows = [row for row in facts()["comparison"] if row["section"] == section]
-    told = " ".join(row["source"] for row in rows)
-    found = set(re.findall(r"\d+(?:\.\d+)?", told))
-    assert set(PRINTED[section].split()) <= found
+    sections = " ".join(row["source"] for row in rows)
+    numbers = set(re.findall(r"\d+(?:\.\d+)?", sections))
+    assert set(PRINTED[section].split()) <= numbers
     for row in rows:
         assert row["kind"].startswith(("compared", "same input", "cannot be compared"))
         if row["kind"].startswith("compared"):
@@ -69,9 +69,9 @@ def test_every_number_of_chapter_5_stands_in_the_table(section):
 
 def test_numbers_of_the_page_are_stored_and_none_is_left_over():
     rows = facts()["element"] + facts()["comparison"]
-    asked = {name for row in rows for name in names_in(row["number"])}
-    assert asked <= set(STORED["values"]) | set(VALIDATED)
-    assert set(STORED["values"]) <= asked
+    names = {name for row in rows for name in names_in(row["number"])}
+    assert names <= set(STORED["values"]) | set(VALIDATED)
+    assert set(STORED["values"]) <= names
 
 
 def test_appendix_d_has_every_tenth_of_the_bend():
@@ -83,7 +83,7 @@ def test_appendix_d_has_every_tenth_of_the_bend():
         assert row["D-1"] + row["D-2"] == pytest.approx(si, rel=0.03)
 
 
-def test_cheap_numbers_are_computed_anew():
-    anew = reproduction.template() | reproduction.adjustment(MODEL)
-    for name, value in anew.items():
+def test_stored_numbers_that_are_fast_to_compute_are_reproduced():
+    computed = reproduction.template() | reproduction.adjustment(MODEL)
+    for name, value in computed.items():
         assert value == pytest.approx(STORED["values"][name], rel=1e-3), name

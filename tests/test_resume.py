@@ -239,24 +239,24 @@ def test_a_truncated_frame_counts_as_absent(tmp_path):
     assert shards.get(4) is None
 
 
-@pytest.mark.parametrize(
-    "forged",
-    [
-        Shard({"time_s": 0.0, "status": "ok", "x": [1]}, None),
-        Shard({"time_s": "0", "status": "ok"}, None),
-        Shard({"status": 1, "time_s": 0.0}, None),
-        Shard({"time_s": 0.0, "status": "ok"}, {"pressure": np.zeros(3)}),
-        Shard({"time_s": 0.0, "status": "ok"}, {"pressure": np.array(["x"])}),
-    ],
+FORGED = (
+    Shard({"time_s": 0.0, "status": "ok", "x": [1]}, None),
+    Shard({"time_s": "0", "status": "ok"}, None),
+    Shard({"status": 1, "time_s": 0.0}, None),
+    Shard({"time_s": 0.0, "status": "ok"}, {"pressure": np.zeros(3)}),
+    Shard({"time_s": 0.0, "status": "ok"}, {"pressure": np.array(["x"])}),
 )
-def test_a_forged_frame_with_the_right_hash_is_refused(tmp_path, forged):
+
+
+def test_a_forged_frame_with_the_right_hash_is_refused(tmp_path):
     frames = slice(0, 8)
     stop_after(tmp_path, 3, frames=frames)
     assert (tmp_path / ".frames" / "000002.frame").exists()
     identity = json.loads((tmp_path / ".frames" / "run.json").read_text())
-    Shards(tmp_path, identity, resume=True).put(1, forged)
-    with pytest.raises(InputError, match="somebody changed it"):
-        simulate(fast_scene(), frames=frames, directory=tmp_path, resume=True)
+    for forged in FORGED:
+        Shards(tmp_path, identity, resume=True).put(1, forged)
+        with pytest.raises(InputError, match="somebody changed it"):
+            simulate(fast_scene(), frames=frames, directory=tmp_path, resume=True)
     (tmp_path / ".frames" / "000001.frame").unlink()
     found = simulate(fast_scene(), frames=frames, directory=tmp_path, resume=True)
     assert found.summary["resumed_frames"] == 1

@@ -87,7 +87,7 @@ def test_an_error_in_the_preparation_is_raised_by_the_caller(tmp_path, capfd):
 
 
 def test_an_error_in_a_job_is_raised_by_the_caller():
-    with pytest.raises(InputError, match="0 is not within"):
+    with pytest.raises(InputError, match="workers: cannot be 0"):
         list(
             PoolOptions(2).answers(Task(functools.partial, (PoolOptions,)), [(0, None), (0, None)])
         )

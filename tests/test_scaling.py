@@ -15,14 +15,14 @@ S = 1.1
 
 
 def case(scale, *drop):
-    """Return the shipped knee at a scale without contact and what else is named."""
+    """Return the shipped knee at a scale without contact, ligaments and the tables `drop`."""
     scene = load_scene(SCENE, {"patient.scale": scale})
     return load_case(scene.model_copy(update=dict.fromkeys(("contact", *drop)) | {"ligament": ()}))
 
 
-def test_at_rest_and_without_springs_forces_in_body_weights_are_those_of_the_original():
-    # forces ~ s³, moments ~ s⁴, arms ~ s; the first frame stands still: no inertia, which
-    # would grow with s⁴ at the same times
+def test_static_forces_without_ligaments_scale_with_body_weight():
+    # Forces scale with s³, moments with s⁴, arms with s. Inertia forces, which scale with s⁴, are
+    # zero in the first frame.
     plain, large = (mechanics_of(case(scale)).frame(0).loads for scale in (1.0, S))
     size = S**3 * float(np.linalg.norm(plain.contact_force))
     np.testing.assert_allclose(
@@ -36,26 +36,26 @@ def test_every_part_of_the_case_is_scaled_by_its_power():
     plain, large = load_case(scene), load_case(load_scene(SCENE, {"patient.scale": S}))
     assert large.body_weight == pytest.approx(S**3 * plain.body_weight)
     for part in ("femoral", "insert", "patella"):
-        one, other = getattr(plain, part), getattr(large, part)
-        np.testing.assert_allclose(other.vertices, S * one.vertices)
-    for one, other in zip(plain.ligaments, large.ligaments, strict=True):
-        assert other.slack_length == pytest.approx(S * one.slack_length)
-        # the same strain gives S² times the force
-        assert other.stiffness * other.slack_length == pytest.approx(
-            S**2 * one.stiffness * one.slack_length
+        original, scaled = getattr(plain, part), getattr(large, part)
+        np.testing.assert_allclose(scaled.vertices, S * original.vertices)
+    for original, scaled in zip(plain.ligaments, large.ligaments, strict=True):
+        assert scaled.slack_length == pytest.approx(S * original.slack_length)
+        # The same strain gives S² times the force.
+        assert scaled.stiffness * scaled.slack_length == pytest.approx(
+            S**2 * original.stiffness * original.slack_length
         )
     for link in ("tibia", "femur"):
-        (mass, centre, inertia), (heavy, there, turning) = (
-            one.chain.segment(link) for one in (plain, large)
+        (mass, centre, inertia), (large_mass, large_centre, large_inertia) = (
+            original.chain.segment(link) for original in (plain, large)
         )
-        assert heavy == pytest.approx(S**3 * mass)
-        np.testing.assert_allclose(there, S * centre)
-        np.testing.assert_allclose(turning, S**5 * inertia)
+        assert large_mass == pytest.approx(S**3 * mass)
+        np.testing.assert_allclose(large_centre, S * centre)
+        np.testing.assert_allclose(large_inertia, S**5 * inertia)
     np.testing.assert_allclose(
         large.motion.coordinates, plain.motion.coordinates * [*[S] * 3, 1, 1, 1]
     )
-    moved = S * plain.chain.link_in("hip", "femur")[:3, 3]
-    np.testing.assert_allclose(large.chain.link_in("hip", "femur")[:3, 3], moved)
+    expected = S * plain.chain.link_in("hip", "femur")[:3, 3]
+    np.testing.assert_allclose(large.chain.link_in("hip", "femur")[:3, 3], expected)
 
 
 def test_a_scale_beyond_people_is_refused():

@@ -28,8 +28,8 @@ ROOT = Path(__file__).parents[1]
 
 
 def test_the_page_is_what_the_schema_says():
-    made = runpy.run_path(str(ROOT / "scripts" / "make_scene_page"))["page"]()
-    assert (ROOT / "docs" / "scene.md").read_text(encoding="utf-8") == made, (
+    page = runpy.run_path(str(ROOT / "scripts" / "make_scene_page"))["page"]()
+    assert (ROOT / "docs" / "scene.md").read_text(encoding="utf-8") == page, (
         "run scripts/make_scene_page"
     )
 
@@ -47,16 +47,22 @@ def test_paths_are_relative_to_the_file(tmp_path):
     assert scene.implant.insert.mesh == tmp_path / "insert.stl"
 
 
-def test_muscles_know_where_the_inserts_mesh_lies_without_contact_too():
-    """Nothing else asks for the insert there: it is read for its place alone."""
+def test_a_case_with_muscles_has_the_pose_of_the_inserts_mesh_without_contact():
+    """Without contact, [muscles] reads the insert only for the pose of its mesh."""
     scene = load_scene(MODEL / "scene.toml")
     with_contact = load_case(scene)
     muscles = {"contact": None, "muscles": SimpleNamespace(emg=None)}
-    found, none = (load_case(scene.model_copy(update=u)) for u in (muscles, {"contact": None}))
-    assert found.insert is None and none.insert is None and none.insert_placement is None
-    np.testing.assert_array_equal(found.insert_placement, with_contact.insert_placement)
+    with_muscles, without_both = (
+        load_case(scene.model_copy(update=u)) for u in (muscles, {"contact": None})
+    )
+    assert (
+        with_muscles.insert is None
+        and without_both.insert is None
+        and without_both.insert_placement is None
+    )
+    np.testing.assert_array_equal(with_muscles.insert_placement, with_contact.insert_placement)
     bottom = load_surface(scene.implant.insert.mesh, "mm", name="insert").vertices
-    lowest = transform(found.insert_placement, bottom)[:, 1].min()
+    lowest = transform(with_muscles.insert_placement, bottom)[:, 1].min()
     assert lowest == pytest.approx(0.0, abs=1e-6)
 
 
@@ -75,7 +81,7 @@ def test_an_override_wins_and_may_make_a_table(tmp_path):
         ({"patella__motion": "solved", "patellar_ligament__length_mm": None}, (), "length_mm"),
     ],
 )
-def test_what_belongs_together(tmp_path, changes, drop, words):
+def test_a_scene_without_a_required_table_or_key_is_refused(tmp_path, changes, drop, words):
     with pytest.raises(InputError, match=words):
         load_scene(write_scene(tmp_path, drop, **changes))
 
@@ -98,7 +104,7 @@ def test_a_ligaments_law_and_unit_go_together(tmp_path, bundle, words):
         load_scene(write_scene(tmp_path, ligament=bundles))
 
 
-def test_two_ligaments_of_one_name(tmp_path):
+def test_two_ligaments_of_one_name_are_refused(tmp_path):
     import tomllib
 
     bundles = tomllib.loads((MODEL / "scene.toml").read_text(encoding="utf-8"))["ligament"]
@@ -106,11 +112,13 @@ def test_two_ligaments_of_one_name(tmp_path):
         load_scene(write_scene(tmp_path, ligament=[bundles[0], bundles[0]]))
 
 
-def test_a_scene_on_a_base_differs_in_what_it_says_alone(tmp_path):
+def test_a_scene_replaces_only_its_own_keys_of_a_base(tmp_path):
     base = write_scene(tmp_path)
-    own = tmp_path / "own.toml"
-    own.write_text('base = "scene.toml"\n[contact]\nfriction = 0.0\n[patient]\nmass_kg = 80.0\n')
-    scene, plain = load_scene(own), load_scene(base)
+    derived = tmp_path / "own.toml"
+    derived.write_text(
+        'base = "scene.toml"\n[contact]\nfriction = 0.0\n[patient]\nmass_kg = 80.0\n'
+    )
+    scene, plain = load_scene(derived), load_scene(base)
     assert (scene.contact.friction, scene.patient.mass_kg) == (0.0, 80.0)
     assert scene.ligament == plain.ligament
     assert scene.contact.model_copy(update={"friction": plain.contact.friction}) == plain.contact
@@ -128,16 +136,16 @@ def test_a_scene_on_a_base_differs_in_what_it_says_alone(tmp_path):
 
 def test_signs_turned_is_the_recording_with_its_columns_negated(tmp_path):
     path = write_scene(tmp_path)
-    whole = load_case(load_scene(path)).motion.raw_coordinates
+    coordinates = load_case(load_scene(path)).motion.raw_coordinates
     turned = load_case(load_scene(path, {"motion.signs_turned": ["ml", "adduction"]})).motion
     signs = [-1.0 if name in ("ml", "adduction") else 1.0 for name in KNEE_COORDINATES]
-    np.testing.assert_allclose(turned.raw_coordinates, whole * signs, atol=1e-12)
+    np.testing.assert_allclose(turned.raw_coordinates, coordinates * signs, atol=1e-12)
     with pytest.raises(InputError, match="unknown role 'rotation_1'"):
         load_case(load_scene(path, {"motion.signs_turned": ["rotation_1"]}))
 
 
 def test_the_case_leaves_the_scene_as_its_file_has_it(tmp_path):
-    """A left knee's points and generic bundles are the case's: the scene's hash is its own."""
+    """Only the case has mirrored points and generic bundles. The scene, and its hash, stay."""
     generic = {"ligaments": ["MCL"]}
     path = write_scene(tmp_path, ("ligament",), generic_ligaments=generic)
     scene = load_scene(path, {"motion.frames": 3})
@@ -145,22 +153,24 @@ def test_the_case_leaves_the_scene_as_its_file_has_it(tmp_path):
     assert case.scene is scene
     assert [bundle.name[:11] for bundle in case.ligaments] == ["generic_MCL"] * 3
     left = scene.model_copy(update={"patient": scene.patient.model_copy(update={"side": "left"})})
-    one, other = (read_patellar_ligament(each).distal.position for each in (scene, left))
-    assert other.tolist() == (MIRROR @ one).tolist()
-    assert one[2] == pytest.approx(0.003)
+    right_point, left_point = (
+        read_patellar_ligament(each).distal.position for each in (scene, left)
+    )
+    assert left_point.tolist() == (MIRROR @ right_point).tolist()
+    assert right_point[2] == pytest.approx(0.003)
     assert left.patellar_ligament == scene.patellar_ligament
 
 
 DECLARING = (recording_tables, tables)
-"""Modules that declare the tables whose keys are read one by one."""
+"""Modules that declare the scene's tables."""
 
 
 def table_classes():
-    """Return the tables of the scene, without those that are handed on whole."""
+    """Yield the tables of the scene, except MaterialTable, which is read as a whole."""
     for module in DECLARING:
         for table in vars(module).values():
-            own = isinstance(table, type) and table.__module__ == module.__name__
-            if own and issubclass(table, SceneTable) and table is not tables.MaterialTable:
+            derived = isinstance(table, type) and table.__module__ == module.__name__
+            if derived and issubclass(table, SceneTable) and table is not tables.MaterialTable:
                 yield table
 
 
@@ -184,15 +194,15 @@ def test_a_key_is_declared_in_one_place(tmp_path, monkeypatch):
     class LongerScene(scene_module.Scene):
         tibia: LongerTable | None = None
 
-    given = []
+    received = []
 
     def reader(table, *rest):
-        given.append(table)
+        received.append(table)
         return load_tibia(table, *rest)
 
     monkeypatch.setattr(scene_module, "Scene", LongerScene)
     monkeypatch.setattr("tkamb.io.recordings.tibia.load_tibia", reader)
     load_case(load_scene(write_scene(tmp_path), {"tibia.tilt_deg": 3.0, "motion.frames": 3}))
-    assert [table.tilt_deg for table in given] == [3.0]
+    assert [table.tilt_deg for table in received] == [3.0]
     page = runpy.run_path(str(ROOT / "scripts" / "make_scene_page"))["page"]()
     assert "| `tilt_deg` | number | `0.0` | tilt of the floor |" in page

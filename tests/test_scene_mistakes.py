@@ -32,9 +32,9 @@ def script():
 def attempt(script, tmp_path, monkeypatch):
     """Return a function that tries a scene's content in a new folder; meshes are read once."""
     keep_meshes(monkeypatch)
-    before = signal.signal(signal.SIGPROF, script._too_long)
+    handler = signal.signal(signal.SIGPROF, script._too_long)
     yield lambda content: script.attempt(as_toml(content), tmp_path / "scene.toml")
-    signal.signal(signal.SIGPROF, before)
+    signal.signal(signal.SIGPROF, handler)
 
 
 def content_of(script, path=SCENE):
@@ -58,8 +58,8 @@ def test_every_change_of_one_key_runs_or_is_refused(script, attempt, first):
     """The test tries every fifteenth change of the shipped scene; the script tries all changes."""
     content = content_of(script)
     for way, words, value in jobs_of(script, content)[first * 7 :: 60]:
-        verdict, said = attempt(script.changed(content, way, value))
-        assert verdict in ("run", "refused"), f"{way} {words}: {said}"
+        verdict, message = attempt(script.changed(content, way, value))
+        assert verdict in ("run", "refused"), f"{way} {words}: {message}"
 
 
 @pytest.mark.slow
@@ -69,13 +69,13 @@ def test_a_part_with_other_axes_and_a_searched_patella(script, attempt, part, ax
     content = content_of(script)
     content["patella"] = {"motion": "solved"}
     content["implant"][part]["axes"] = axes
-    verdict, said = attempt(content)
-    assert verdict in ("run", "refused"), said
+    verdict, message = attempt(content)
+    assert verdict in ("run", "refused"), message
 
 
 def test_a_moment_that_does_not_change_its_sign_is_a_lost_patella(monkeypatch):
     """Searches from the two ends of an interval may end at different poses of the patella."""
-    here, there = (
+    first, second = (
         SimpleNamespace(coordinates=np.array([0.0, 0.0, turn]), moment=moment)
         for turn, moment in ((0.0, 1.0), (0.1, -1.0))
     )
@@ -90,7 +90,7 @@ def test_a_moment_that_does_not_change_its_sign_is_a_lost_patella(monkeypatch):
             ),
         )
         with pytest.raises(patella_search._Lost) as lost:
-            search.between(here, there)
+            search.between(first, second)
         assert lost.value.status is PatellaStatus.MOMENT
 
 
@@ -104,5 +104,5 @@ def test_a_joint_centre_without_markers_is_refused(script, attempt):
             {"name": "k", "markers_mm": {}, "centre_mm": [0.0] * 3, "tibia_mm": [0.0] * 3}
         ],
     }
-    verdict, said = attempt(content)
-    assert verdict == "refused" and "markers_mm" in said
+    verdict, message = attempt(content)
+    assert verdict == "refused" and "markers_mm" in message

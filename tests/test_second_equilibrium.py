@@ -19,11 +19,11 @@ JW = Path(__file__).parents[2] / "shared" / "data" / "jw"
 RELEASED = ["adduction", "axial_rotation", "ap", "ml"]
 
 
-def equilibrium(place, force=1000.0, problem=""):
+def equilibrium(coordinates, force=1000.0, problem=""):
     """Return an equilibrium at coordinates (6,)."""
     contact = SimpleNamespace(wrench=np.array([0.0, force, 0.0, 0.0, 0.0, 0.0]))
-    end = SimpleNamespace(status=BalanceStatus.OK)
-    return KneeEquilibrium(np.array(place), None, None, contact, end, 1, 1, 0.0, problem)
+    balance = SimpleNamespace(status=BalanceStatus.OK)
+    return KneeEquilibrium(np.array(coordinates), None, None, contact, balance, 1, 1, 0.0, problem)
 
 
 class Wells:
@@ -31,49 +31,51 @@ class Wells:
 
     released = (0, 1)
 
-    def __init__(self, *places):
-        self.places, self.searches = places, 0
+    def __init__(self, *positions):
+        self.positions, self.searches = positions, 0
 
     def find(self, instant, start, points=None, before=None):
         self.searches += 1
-        nearest = min(self.places, key=lambda x: abs(x - start[0]))
+        nearest = min(self.positions, key=lambda x: abs(x - start[0]))
         return equilibrium([nearest, *start[1:]], 1000.0 + 1e5 * nearest)
 
 
-def found(knee, recorded, *previous):
+def equilibrium_of_frame(knee, recorded, *previous):
     """Return the equilibrium of a frame that was recorded at an AP position, m."""
     pair = SimpleNamespace(first_touch_height=lambda pose: 0.0)
     instant = SimpleNamespace(coordinates=np.array([recorded, 0, 0, 0, 0, 0.0]), muscles=None)
     poses = InitialPoses(knee, pair, None)
-    return poses.rest(instant, [equilibrium([place, 0, 0, 0, 0, 0.0]) for place in previous], {})
+    return poses.equilibrium(
+        instant, [equilibrium([position, 0, 0, 0, 0, 0.0]) for position in previous], {}
+    )
 
 
-def test_a_search_that_follows_the_last_frame_is_not_repeated():
+def test_a_search_that_ends_near_the_last_frame_is_not_repeated():
     knee = Wells(0.0, 20e-3)
-    assert found(knee, 20e-3, 0.5 * INITIAL_POSE.max_continuation).second == ""
+    assert equilibrium_of_frame(knee, 20e-3, 0.5 * INITIAL_POSE.max_continuation).second == ""
     assert knee.searches == 1
 
 
 def test_a_second_equilibrium_is_reported():
-    rest = found(Wells(0.0, 20e-3), 20e-3, 3e-3)
-    assert rest.coordinates[0] == 0.0
-    assert "20.0 mm and 0.0 deg away, with 3000 N instead of 1000 N" in rest.second
-    assert found(Wells(0.0), 20e-3, 3e-3).second == ""
+    result = equilibrium_of_frame(Wells(0.0, 20e-3), 20e-3, 3e-3)
+    assert result.coordinates[0] == 0.0
+    assert "20.0 mm and 0.0 deg away, with 3000 N instead of 1000 N" in result.second
+    assert equilibrium_of_frame(Wells(0.0), 20e-3, 3e-3).second == ""
 
 
-def test_a_frame_without_earlier_ones_is_searched_from_both_sides():
-    assert "second" in found(Wells(0.0, 7e-3), 3e-3).second
-    assert found(Wells(0.0, 30e-3), 3e-3).second == ""
+def test_a_first_frame_is_searched_from_both_sides():
+    assert "second" in equilibrium_of_frame(Wells(0.0, 7e-3), 3e-3).second
+    assert equilibrium_of_frame(Wells(0.0, 30e-3), 3e-3).second == ""
 
 
 @pytest.mark.skipif(not JW.is_dir(), reason="subject JW's files are not beside the project")
 def test_jw_at_3_275_s_has_two_equilibria(tmp_path, capsys):
     """The previous frame leads to 466 N, the recorded pose to 442 N at 17 deg of adduction."""
-    given = ["--c3d", f"{JW}/motion/jw_ngait_og3.c3d", "--side", "right", "--mass-kg", "66.7"]
+    arguments = ["--c3d", f"{JW}/motion/jw_ngait_og3.c3d", "--side", "right", "--mass-kg", "66.7"]
     for part, name in (("femoral", "femoral_component"), ("insert", "tibial_insert")):
-        given += [f"--{part}", f"{JW}/geometry/{name}.stl"]
-    given += ["--mesh-unit", "m", "--mesh-axes=-x,+y,-z", "--out", str(tmp_path)]
-    assert main(["import", f"{JW}/JW.osim", *given]) == 0
+        arguments += [f"--{part}", f"{JW}/geometry/{name}.stl"]
+    arguments += ["--mesh-unit", "m", "--mesh-axes=-x,+y,-z", "--out", str(tmp_path)]
+    assert main(["import", f"{JW}/JW.osim", *arguments]) == 0
     changes = {"contact.model": "foundation", "contact.resolution_mm": 3.0}
     scene = tkamb.load_scene(tmp_path / "scene.toml", changes)
     status = tkamb.simulate(scene, frames=slice(18, 43, 6))["status"]
@@ -89,12 +91,12 @@ def test_a_frame_is_ok_only_if_its_measured_residual_is_small(monkeypatch):
     scene = tkamb.load_scene(MODEL / "scene.toml", changes)
     measured, measure = [], released.ReleasedKnee._measured
 
-    def kept(self, *given):
-        knee = measure(self, *given)
+    def record(self, *arguments):
+        knee = measure(self, *arguments)
         measured.append(knee.residual)
         return knee
 
-    monkeypatch.setattr(released.ReleasedKnee, "_measured", kept)
+    monkeypatch.setattr(released.ReleasedKnee, "_measured", record)
     assert "does not converge" not in tkamb.simulate(scene, frames=slice(60, 61))["status"][0]
     assert 0.0 < measured[-1] < RELEASED_KNEE.residual_tolerance
     loose = replace(balance.BALANCE, force_tolerance=200.0, step_tolerance=1.0)

@@ -43,18 +43,18 @@ def bend():
 
 
 @pytest.fixture(scope="module")
-def resting(bend):
+def equilibria(bend):
     """Return body and contact of a few frames, each with the previous frame as initial guess."""
-    contacts, found = [], {}
+    contacts, results = [], {}
     for k in (40, 41, 42, 60, 80):
-        found[k] = bend.frame(k, contacts)
-        contacts.append(found[k][1])
-    return found
+        results[k] = bend.frame(k, contacts)
+        contacts.append(results[k][1])
+    return results
 
 
-def test_the_shank_is_in_equilibrium(bend, resting):
+def test_the_shank_is_in_equilibrium(bend, equilibria):
     """The sum of ground, weight and inertia, ligaments, patellar ligament and contact is zero."""
-    for k, (body, contact) in resting.items():
+    for k, (body, contact) in equilibria.items():
         geometry = contact.equilibrium.geometry
         total = external_wrench(geometry, contact.equilibrium.coordinates)
         shank = [load for load in geometry.ligaments if load.link.startswith("tibia")]
@@ -68,8 +68,8 @@ def test_the_shank_is_in_equilibrium(bend, resting):
         assert np.abs(total[3:]).max() < 0.02, k
 
 
-def test_equilibrium_and_deformation_are_one_state(resting):
-    for body, contact in resting.values():
+def test_the_loads_of_the_equations_are_those_of_the_deformation(equilibria):
+    for body, contact in equilibria.values():
         for name in ("ap", "ml"):
             assert abs(body.loads.values[f"residual_{name}"]) < 0.1
         assert abs(body.loads.values["residual_axial"]) < 0.03
@@ -81,10 +81,10 @@ def test_equilibrium_and_deformation_are_one_state(resting):
 def test_flexion_and_coordinates_that_are_not_released_stay_recorded(bend):
     partly = side_of(BEND, released=["ml", "adduction"])
     _, contact = partly.frame(60)
-    kept = np.abs(contact.equilibrium.coordinates - partly.mechanics.motion.coordinates[60])
+    displacement = np.abs(contact.equilibrium.coordinates - partly.mechanics.motion.coordinates[60])
     assert contact.result is not None
-    assert (kept[[0, 3, 5]] == 0).all()
-    assert (kept[[2, 4]] > 0).all()
+    assert (displacement[[0, 3, 5]] == 0).all()
+    assert (displacement[[2, 4]] > 0).all()
 
 
 @pytest.mark.parametrize(
@@ -93,16 +93,16 @@ def test_flexion_and_coordinates_that_are_not_released_stay_recorded(bend):
         [5e-3, 2e-3, 0, 0, np.radians(2)],
         [-5e-3, 1e-3, 0, np.radians(-5), np.radians(2)],
         [0, 3e-3, -5e-3, np.radians(5), np.radians(-5)],
-        # over the rim, where columns that start beside their point used to end the search
+        # over the rim of the insert
         [-5e-3, 0, 5e-3, np.radians(-5), 0],
     ],
 )
-def test_guesses_5_mm_and_5_deg_away_reach_the_same_equilibrium(bend, resting, away):
-    home = resting[60][1].equilibrium.coordinates
-    start = bend.starts.on_the_insert(home + np.append(away, 0.0))
-    again = bend.released.find(bend.mechanics.instant(60), start)
-    assert again.problem == ""
-    assert np.abs((again.coordinates - home) * SCALE).max() < 2e-5
+def test_guesses_5_mm_and_5_deg_away_reach_the_same_equilibrium(bend, equilibria, away):
+    expected = equilibria[60][1].equilibrium.coordinates
+    start = bend.starts.at_first_touch(expected + np.append(away, 0.0))
+    result = bend.released.find(bend.mechanics.instant(60), start)
+    assert result.problem == ""
+    assert np.abs((result.coordinates - expected) * SCALE).max() < 2e-5
 
 
 def test_a_frame_that_needs_flexors_has_a_slack_quadriceps(bend):
@@ -120,24 +120,26 @@ def test_a_frame_that_needs_flexors_has_a_slack_quadriceps(bend):
         assert knee.balance.status is BalanceStatus.OK and knee.patella.status.found
         assert body.loads.values["residual_flexion"] < -10.0
         away = np.array([2e-3, 0, 1e-3, 0, np.radians(1), 0])
-        start = side.starts.on_the_insert(knee.coordinates + away)
-        again = side.released.find(side.mechanics.instant(k), start)
-        assert np.abs((again.coordinates - knee.coordinates) * SCALE).max() < 2e-5
+        start = side.starts.at_first_touch(knee.coordinates + away)
+        result = side.released.find(side.mechanics.instant(k), start)
+        assert np.abs((result.coordinates - knee.coordinates) * SCALE).max() < 2e-5
 
 
-def test_a_guess_beyond_the_rim_is_reported_as_failed(bend, resting):
-    home = resting[60][1].equilibrium.coordinates
-    start = bend.starts.on_the_insert(home + np.array([-8e-3, 0, 8e-3, np.radians(-8), 0, 0]))
-    ended = bend.released.find(bend.mechanics.instant(60), start)
-    assert ended.problem == "released: out of the contact model's range"
+def test_a_guess_beyond_the_rim_is_reported_as_failed(bend, equilibria):
+    equilibrium = equilibria[60][1].equilibrium.coordinates
+    start = bend.starts.at_first_touch(
+        equilibrium + np.array([-8e-3, 0, 8e-3, np.radians(-8), 0, 0])
+    )
+    result = bend.released.find(bend.mechanics.instant(60), start)
+    assert result.problem == "released: out of the contact model's range"
 
 
-def test_friction_changes_the_equilibrium(bend, resting):
-    """Without friction the equilibrium differs, and every step of the search has positive work."""
+def test_friction_changes_the_equilibrium(bend, equilibria):
+    """Without friction the equilibrium differs by up to 5 mm."""
     smooth = side_of(BEND, friction=0.0)
     _, contact = smooth.frame(60)
     away = np.abs(
-        (contact.equilibrium.coordinates - resting[60][1].equilibrium.coordinates) * SCALE
+        (contact.equilibrium.coordinates - equilibria[60][1].equilibrium.coordinates) * SCALE
     )
     assert 1e-5 < away.max() < 5e-3
     assert contact.equilibrium.balance.status is BalanceStatus.OK
@@ -149,15 +151,15 @@ def test_a_frame_without_equilibrium_fails_with_the_reason(bend):
     side = contact_side(case, mechanics_of(case))
     start = case.motion.coordinates[60].copy()
     start[0] += 60e-3
-    ended = side.released.find(side.mechanics.instant(60), start)
-    assert ended.problem.startswith("released")
+    result = side.released.find(side.mechanics.instant(60), start)
+    assert result.problem.startswith("released")
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not DATA.is_dir(), reason="needs subject DM's files beside the project")
-def test_a_recorded_position_that_climbs_the_eminence_slides_back_into_the_dishes():
-    """In DM's frame at half of the cycle one condyle carries the whole load on its flank, unless ML
-    and adduction are released.
+def test_a_condyle_recorded_on_the_eminence_slides_back_into_the_dish():
+    """At half of DM's cycle one condyle carries all of the load, unless ML and adduction are
+    released.
     """
     few = {"motion.frames": 21}
     body, contact = side_of(DM, few, released=[]).frame(10)
@@ -188,9 +190,8 @@ def test_a_femur_beside_the_insert_fails_with_the_reason(bend):
     assert body.loads.problems == (contact.problem,)
 
 
-def test_a_frame_at_rest_whose_equations_fail_has_no_numbers(monkeypatch):
-    """A frame without equilibrium has recorded values and the status of the search, and NaN
-    elsewhere."""
+def test_a_frame_in_equilibrium_whose_equations_fail_has_no_numbers(monkeypatch):
+    """The frame has its inputs, times and numbers of the search; all other columns are NaN."""
     overrides = COARSE | {"contact.released": ALL}
     solver = FrameSolver(load_case(load_scene(BEND, overrides)))
     monkeypatch.setattr(
@@ -198,8 +199,8 @@ def test_a_frame_at_rest_whose_equations_fail_has_no_numbers(monkeypatch):
     )
     _, row, arrays = solver.solve(60)
     assert row["status"].startswith("failed: no signs are right")
-    known = {name for name, value in row.items() if name != "status" and np.isfinite(value)}
-    assert known == {
+    finite = {name for name, value in row.items() if name != "status" and np.isfinite(value)}
+    assert finite == {
         *("time_s", "flexion_deg", "body_seconds", "query_seconds", "contact_seconds"),
         *("contact_trials", "coupling_iterations", "smallest_stiffness_N_per_mm"),
     }

@@ -24,14 +24,14 @@ def test_rim_of_a_cylinder_does_not_tilt_the_wall() -> None:
 
 
 def test_corner_normals_of_a_sphere_are_more_accurate_than_facet_normals() -> None:
-    """Their error is below a tenth of the facets' error, and falls with the edge length."""
+    """The error is below a tenth of the facets' error, and falls with the edge length."""
     errors = []
     for level in (3, 4, 5):
         part = surface(trimesh.creation.icosphere(level, 1.0))
-        off = np.linalg.norm(part.corner_normals - part.triangles, axis=2)
+        error = np.linalg.norm(part.corner_normals - part.triangles, axis=2)
         facets = np.linalg.norm(part.face_normals[:, None] - part.triangles, axis=2)
-        assert off.mean() < 0.1 * facets.mean()
-        errors.append(off.mean())
+        assert error.mean() < 0.1 * facets.mean()
+        errors.append(error.mean())
     assert errors[0] > 1.9 * errors[1] > 1.9**2 * errors[2]
 
 

@@ -31,19 +31,23 @@ from tkamb.run.summary import reserves
 
 FRICTION = 0.05
 SHIPPED = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
-PLACES = {"behind": [-0.06, -0.45, 0.0], "ahead": [0.06, -0.45, 0.0], "aside": [-0.05, -0.45, 0.12]}
+GROUND_POINTS = {
+    "behind": [-0.06, -0.45, 0.0],
+    "ahead": [0.06, -0.45, 0.0],
+    "aside": [-0.05, -0.45, 0.12],
+}
 
 
-def stood_upon(place):
+def with_ground_force(point):
     """Return the bent knee with 700 N of ground reaction at a point (3,), m, insert frame."""
-    force = PointForces("tibia", np.array([place]), 700 * UP[None])
+    force = PointForces("tibia", np.array([point]), 700 * UP[None])
     return replace(bent_knee(), ground=force)
 
 
-@pytest.mark.parametrize("where", PLACES)
+@pytest.mark.parametrize("where", GROUND_POINTS)
 def test_static_optimisation_and_equations_give_the_same_quadriceps(where):
     muscles = SharedMuscles(two_flexors(1))
-    geometry, loads = muscles.frame(0).solve(stood_upon(PLACES[where]), FRICTION)
+    geometry, loads = muscles.frame(0).solve(with_ground_force(GROUND_POINTS[where]), FRICTION)
     assert loads.problems == ()
     assert geometry.share.force.min() > 50.0
     quadriceps = geometry.extensor.tension(loads.values)
@@ -52,7 +56,7 @@ def test_static_optimisation_and_equations_give_the_same_quadriceps(where):
 
 def test_flexors_supply_the_moment_that_a_slack_quadriceps_lacks():
     """With the ground reaction in front, flexors reduce the missing moment to a reserve of 1 %."""
-    knee = stood_upon([0.06, -0.45, 0.0])
+    knee = with_ground_force([0.06, -0.45, 0.0])
     alone = solve_knee(knee, FRICTION)
     geometry, loads = (
         SharedMuscles(two_flexors(1, reserve=0.5, least=0.0)).frame(0).solve(knee, FRICTION)
@@ -65,8 +69,8 @@ def test_flexors_supply_the_moment_that_a_slack_quadriceps_lacks():
     assert np.linalg.norm(loads.contact_force) > np.linalg.norm(alone.contact_force) + 200.0
 
 
-def test_without_strength_of_the_others_nothing_changes():
-    knee = stood_upon(PLACES["behind"])
+def test_muscles_without_strength_do_not_change_the_loads():
+    knee = with_ground_force(GROUND_POINTS["behind"])
     trial = two_flexors(1, strengths=(6000.0, 1e-9, 1e-9), reserve=1e-3, least=0.0)
     geometry, loads = SharedMuscles(trial).frame(0).solve(knee, FRICTION)
     alone = solve_knee(knee, FRICTION)
@@ -76,24 +80,24 @@ def test_without_strength_of_the_others_nothing_changes():
 
 def test_two_flexors_share_by_strength_and_the_arms_of_the_knee():
     """Without reserve, the optimal activations a_i are proportional to R_i F_i."""
-    knee = stood_upon(PLACES["ahead"])
+    knee = with_ground_force(GROUND_POINTS["ahead"])
     trial = two_flexors(1, reserve=1e-3, least=0.0)
     share = SharedMuscles(trial).frame(0).share(knee, FRICTION, frozenset())
     force, step = share.force, 1.0
-    pulled = []
+    tensions = []
     for i in (1, 2):  # moment arms by differences of the knee's equations
-        more = np.zeros(3)
-        more[i] = step
-        loaded = replace(knee, share=replace(share, force=more, reserve=np.zeros(1)))
-        pulled.append(_taut_quadriceps(loaded))
-    none = replace(knee, share=replace(share, force=np.zeros(3), reserve=np.zeros(1)))
-    arms = np.array(pulled) - _taut_quadriceps(none)
+        forces = np.zeros(3)
+        forces[i] = step
+        loaded = replace(knee, share=replace(share, force=forces, reserve=np.zeros(1)))
+        tensions.append(_taut_quadriceps(loaded))
+    unloaded = replace(knee, share=replace(share, force=np.zeros(3), reserve=np.zeros(1)))
+    arms = np.array(tensions) - _taut_quadriceps(unloaded)
     expected = arms * np.array(STRENGTHS[1:]) ** 2
     assert force[1] / force[2] == pytest.approx(expected[0] / expected[1], rel=1e-6)
 
 
 def _taut_quadriceps(geometry):
-    """Return the quadriceps' tension; negative: it would push."""
+    """Return the tension of the quadriceps, N; negative if the quadriceps would push."""
     from tkamb.knee.equations import KneeSystem
     from tkamb.knee.unknowns import LoadState
 
@@ -101,8 +105,8 @@ def _taut_quadriceps(geometry):
     return KneeSystem(geometry, FRICTION, taut).solution.values["muscle_quadriceps"]
 
 
-def test_the_work_of_a_line_is_that_of_its_shortening():
-    """The generalised force on each knee coordinate is -F dL/dq, by differences of the length."""
+def test_the_generalised_force_of_a_line_is_the_work_of_its_shortening():
+    """On each knee coordinate it is -F dL/dq, by differences of the length L."""
     rng = np.random.default_rng(3)
     shank, thigh = rng.normal(scale=0.1, size=(2, 2, 3))
     force, tibia = np.array([700.0, 300.0]), np.eye(4)
@@ -110,19 +114,21 @@ def test_the_work_of_a_line_is_that_of_its_shortening():
         ("a", "b"), force, force, ("knee",), np.zeros(1), np.zeros(1), 0, np.arange(2),
         CrossingLines(shank, thigh),
     )  # fmt: skip
-    place = np.array([0.003, 0.04, -0.002, 0.1, -0.05, 0.7])
+    coordinates = np.array([0.003, 0.04, -0.002, 0.1, -0.05, 0.7])
 
     def lengths(q):
         return np.linalg.norm(transform(knee_pose(q), thigh) - shank, axis=1)
 
     step = 1e-6
-    slopes = [(lengths(place + e) - lengths(place - e)) / (2 * step) for e in step * np.eye(6)]
-    on_femur = -knee_axes(place) @ share.wrench(tibia, knee_pose(place))
+    slopes = [
+        (lengths(coordinates + e) - lengths(coordinates - e)) / (2 * step) for e in step * np.eye(6)
+    ]
+    on_femur = -knee_axes(coordinates) @ share.wrench(tibia, knee_pose(coordinates))
     np.testing.assert_allclose(on_femur, -np.array(slopes) @ force, rtol=1e-7, atol=1e-6)
 
 
 def test_the_wrench_of_the_released_knee_is_that_of_the_equations():
-    trial, knee = two_flexors(1), stood_upon(PLACES["behind"])
+    trial, knee = two_flexors(1), with_ground_force(GROUND_POINTS["behind"])
     share = SharedMuscles(trial).frame(0).share(knee, FRICTION, frozenset())
     state = knee.state
     on_tibia = [load for load in share.loads(state) if load.link == "tibia"]
@@ -133,14 +139,18 @@ def test_the_wrench_of_the_released_knee_is_that_of_the_equations():
 def test_a_muscle_without_a_path_fails_its_frame_by_name():
     trial = two_flexors(1)
     trial.problems.arms[0, 1] = np.nan
-    geometry, loads = SharedMuscles(trial).frame(0).solve(stood_upon(PLACES["behind"]), FRICTION)
+    geometry, loads = (
+        SharedMuscles(trial).frame(0).solve(with_ground_force(GROUND_POINTS["behind"]), FRICTION)
+    )
     assert "no taut path of hamstring" in loads.problems[0]
     assert np.isnan(loads.contact_force).all()
     assert np.isnan(geometry.share.force).all()
 
 
 def test_a_frame_without_its_patella_fails_by_name():
-    lost = replace(stood_upon(PLACES["behind"]), extensor=None, problems=("patella lost",))
+    lost = replace(
+        with_ground_force(GROUND_POINTS["behind"]), extensor=None, problems=("patella lost",)
+    )
     geometry, loads = SharedMuscles(two_flexors(1)).frame(0).solve(lost, FRICTION)
     assert "patella lost" in loads.problems[0]
     assert np.isnan(geometry.share.force).all()
@@ -158,7 +168,7 @@ def test_a_scene_with_muscles_needs_its_own_patella(tmp_path):
 
 
 def test_without_the_tables_neither_muscles_nor_emg_nor_measurements_are_imported():
-    own = (
+    modules = (
         "tkamb.run.muscles",
         "tkamb.io.opensim",
         "tkamb.io.recordings.measured",
@@ -169,10 +179,12 @@ def test_without_the_tables_neither_muscles_nor_emg_nor_measurements_are_importe
         "from tkamb.io.scene.case import load_case; "
         "from tkamb.run.read_scene import mechanics_of; "
         f"m = mechanics_of(load_case(load_scene({str(SHIPPED)!r}))); assert m.muscles is None; "
-        f"print([n for n in sys.modules if n.startswith({own})])"
+        f"print([n for n in sys.modules if n.startswith({modules})])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    process = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert process.stdout.strip() == "[]"
 
 
 def test_columns_of_muscles_have_their_positions():
@@ -189,18 +201,18 @@ def test_the_summary_reports_the_reserve():
         "reserve_knee_Nm": np.array([0.1, -3.0, np.nan]),
         "joint_moment_knee_Nm": np.array([-40.0, 20.0, np.nan]),
     }
-    told = reserves(columns)["knee"]
-    assert told["largest_Nm"] == 3.0
-    assert told["percent_of_largest_moment"] == pytest.approx(7.5)
-    assert told["frames_above_5_percent"] == 1
+    knee_reserve = reserves(columns)["knee"]
+    assert knee_reserve["largest_Nm"] == 3.0
+    assert knee_reserve["percent_of_largest_moment"] == pytest.approx(7.5)
+    assert knee_reserve["frames_above_5_percent"] == 1
 
 
 def test_the_rotation_since_the_lines_were_computed_is_reported():
-    found = pose(Rotation.from_euler("z", -30, degrees=True).as_matrix(), [0.01, 0.4, 0.0])
+    computed_at = pose(Rotation.from_euler("z", -30, degrees=True).as_matrix(), [0.01, 0.4, 0.0])
     now = pose(Rotation.from_euler("zx", (-40, 3), degrees=True).as_matrix(), [0.0, 0.4, 0.0])
     tibia = pose(Rotation.from_euler("y", 25, degrees=True).as_matrix(), [0.1, 0.2, 0.3])
-    for knee, angle in ((found, 0.0), (now, np.hypot(10, 3))):
+    for knee, angle in ((computed_at, 0.0), (now, np.hypot(10, 3))):
         state = SimpleNamespace(pose={"tibia": tibia, "femur": tibia @ knee}.__getitem__)
-        turned = np.degrees(CrossingLines(SHANK, THIGH, found).turned(state))
+        turned = np.degrees(CrossingLines(SHANK, THIGH, computed_at).turned(state))
         assert turned == pytest.approx(angle, abs=0.05)
         assert np.isnan(CrossingLines(SHANK, THIGH).turned(state))

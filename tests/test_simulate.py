@@ -68,8 +68,8 @@ def test_times_of_parts_add_up_to_less_than_the_whole(timed_bend):
 def test_a_part_of_the_motion_has_the_results_of_the_whole(bend, monkeypatch):
     """Patella and slip are computed for these frames alone; slip is counted from frame 0."""
     places, lows = [], []
-    monkeypatch.setattr(PatellofemoralContact, "at", seen(places, PatellofemoralContact.at))
-    monkeypatch.setattr(LowestPoints, "at", seen(lows, LowestPoints.at))
+    monkeypatch.setattr(PatellofemoralContact, "at", recording(places, PatellofemoralContact.at))
+    monkeypatch.setattr(LowestPoints, "at", recording(lows, LowestPoints.at))
     part = simulate(fast_scene(), frames=slice(40, 51, 10))
     assert len(places) == 2
     assert len(lows) == 52
@@ -77,25 +77,27 @@ def test_a_part_of_the_motion_has_the_results_of_the_whole(bend, monkeypatch):
         if name == "status":
             assert values == bend.status[4:6]
         elif name not in CLOCKS and name != "iterations":
-            close = (
+            tolerance = (
                 1e-5 if name in CONTACT_COLUMNS else 1e-12
             )  # the contact has another initial guess
-            np.testing.assert_allclose(values, bend[name][4:6], rtol=close, err_msg=name)
+            np.testing.assert_allclose(values, bend[name][4:6], rtol=tolerance, err_msg=name)
 
 
-def seen(arguments, method):
-    """Return a method that notes what it is asked."""
+def recording(arguments, method):
+    """Return a method that records its argument."""
 
-    def asked(self, argument):
+    def recorded(self, argument):
         arguments.append(argument)
         return method(self, argument)
 
-    return asked
+    return recorded
 
 
 def test_forces_have_the_trends_of_sharma(bend):
-    """They rise with flexion, PL/Q falls from 1, PF/Q rises to about 1, as in the README.
+    """Forces rise with flexion, as in the README.
 
+    The ratio PL/Q of patellar ligament to quadriceps falls from 1. The ratio PF/Q of patellofemoral
+    force to quadriceps rises to about 1.
     In Sharma (2008) PL/Q ends at 0.45 and PF/Q begins at 0.2; the README states this difference.
     """
     force, quadriceps = bend["force_total_BW"], bend["quadriceps_N"]
@@ -181,6 +183,12 @@ def test_refused_frames_are_refused_with_the_available_range():
         simulate(fast_scene(), frames=slice(0, 3000, 10))
 
 
+def test_frames_keep_their_place_on_the_cycle_axis_without_a_known_cycle():
+    overrides = {"output.axis": "cycle"}
+    summary = simulate(fast_scene(), overrides=overrides, frames=slice(25, 26)).summary
+    assert summary["cycle_percent_s"] == pytest.approx([0.0, 4.0])
+
+
 def test_a_folder_instead_of_a_scene_is_refused_with_the_name_of_its_scene():
     with pytest.raises(InputError, match=r"is a folder, not a file; give .*scene\.toml"):
         simulate(MODEL)
@@ -189,10 +197,10 @@ def test_a_folder_instead_of_a_scene_is_refused_with_the_name_of_its_scene():
 def test_a_frame_with_contact_out_of_range_fails_with_its_reason(monkeypatch):
     press = ElasticFoundation.press
 
-    def losing(self, *arguments):
+    def failing(self, *arguments):
         return replace(press(self, *arguments), status=ContactStatus.OUT_OF_RANGE)
 
-    monkeypatch.setattr(ElasticFoundation, "press", losing)
+    monkeypatch.setattr(ElasticFoundation, "press", failing)
     results = simulate(fast_scene(), contact="foundation", frames=slice(40, 41))
     assert results.status[0].startswith("failed: contact out of range")
     assert np.isnan(results["medial_peak_pressure_MPa"]).all()

@@ -87,14 +87,14 @@ def motion(ap: Array | float, flexion: Array | float, axial: Array | float = 0.0
     return np.column_stack(columns)
 
 
-def both(found: tuple[CondyleSlip, CondyleSlip | None]) -> tuple[CondyleSlip, CondyleSlip]:
-    assert found[1] is not None
-    return found[0], found[1]
+def both(sides: tuple[CondyleSlip, CondyleSlip | None]) -> tuple[CondyleSlip, CondyleSlip]:
+    assert sides[1] is not None
+    return sides[0], sides[1]
 
 
 def test_rolling_on_a_plate_has_equal_arcs_and_no_slip(roller: Surface) -> None:
-    moved = motion(0.01 - RADIUS * FLEXION, FLEXION)
-    for side in both(condyle_slip(roller, bed(False), 0.0, moved)):
+    coordinates = motion(0.01 - RADIUS * FLEXION, FLEXION)
+    for side in both(condyle_slip(roller, bed(False), 0.0, coordinates)):
         assert side.femoral_arc[-1] == pytest.approx(RADIUS * FLEXION[-1], rel=1e-3)
         assert side.insert_arc[-1] == pytest.approx(RADIUS * FLEXION[-1], rel=1e-3)
         assert np.abs(side.slip).max() < 1e-3 * side.femoral_arc[-1]
@@ -123,22 +123,22 @@ def test_axial_rotation_alone_is_no_slip(roller: Surface) -> None:
 
 def test_rolling_with_axial_rotation_has_no_slip(roller: Surface) -> None:
     angle = np.deg2rad(np.linspace(0.0, 10.0, FRAMES))
-    moved = motion(
+    coordinates = motion(
         0.01 - RADIUS * np.cumsum(np.append(0.0, np.cos(angle[1:]) * np.diff(FLEXION))),
         FLEXION,
         angle,
     )
-    for side in both(condyle_slip(roller, bed(False), 0.0, moved)):
+    for side in both(condyle_slip(roller, bed(False), 0.0, coordinates)):
         assert abs(side.slip[-1]) < 1e-3 * RADIUS * FLEXION[-1]
 
 
-def test_arcs_in_a_trough(roller: Surface) -> None:
+def test_arcs_in_a_trough_have_their_closed_form(roller: Surface) -> None:
     """The lowest point is below the axis; its projection moves on the trough's arc."""
     ap = np.linspace(0.012, -0.014, FRAMES)
-    moved = motion(ap, FLEXION)
-    moved[:, 1] += 5e-3
+    coordinates = motion(ap, FLEXION)
+    coordinates[:, 1] += 5e-3
     expected = TROUGH * (np.arcsin(ap[0] / TROUGH) - np.arcsin(ap / TROUGH))
-    for side in both(condyle_slip(roller, bed(True), 0.0, moved)):
+    for side in both(condyle_slip(roller, bed(True), 0.0, coordinates)):
         assert side.insert_arc[-1] == pytest.approx(expected[-1], rel=1e-3)
         assert side.femoral_arc[-1] == pytest.approx(RADIUS * FLEXION[-1], rel=1e-3)
         assert side.slip[-1] == pytest.approx(RADIUS * FLEXION[-1] - expected[-1], rel=3e-3)
@@ -148,13 +148,13 @@ def test_slip_velocity_is_the_rigid_body_velocity(roller: Surface) -> None:
     """Rolling, slip and axial rotation, by arcs and by v + w x r."""
     time = np.linspace(0.0, 1.0, FRAMES)
     angle = np.deg2rad(8.0) * time**2
-    moved = motion(0.012 - 0.014 * time, FLEXION, angle)
-    rates = np.gradient(moved, time, axis=0)
-    velocity, spin = knee_twist(moved, rates)
+    coordinates = motion(0.012 - 0.014 * time, FLEXION, angle)
+    rates = np.gradient(coordinates, time, axis=0)
+    velocity, spin = knee_twist(coordinates, rates)
     for side, z in zip(
-        both(condyle_slip(roller, bed(False), 0.0, moved)), (-0.015, 0.015), strict=True
+        both(condyle_slip(roller, bed(False), 0.0, coordinates)), (-0.015, 0.015), strict=True
     ):
-        arm = knee_pose(moved)[:, :3, :3] @ np.array([0.0, 0.0, z]) - [0.0, RADIUS, 0.0]
+        arm = knee_pose(coordinates)[:, :3, :3] @ np.array([0.0, 0.0, z]) - [0.0, RADIUS, 0.0]
         rigid = sliding_velocity(velocity, spin, arm, arm[:, 2])
         inner = slice(2, -2)
         by_arcs = side.slip_velocity(time)[inner]
@@ -168,22 +168,22 @@ def test_arc_is_exact_on_a_circle() -> None:
 
 
 def test_the_rolling_of_a_roll_slip_motion_is_recovered(roller: Surface) -> None:
-    given = motion(0.01, FLEXION)
-    rolled = roll_slip_motion(roller, bed(False), 0.0, given, np.zeros(FRAMES))
+    original = motion(0.01, FLEXION)
+    rolled = roll_slip_motion(roller, bed(False), 0.0, original, np.zeros(FRAMES))
     assert rolled[:, 0] == pytest.approx(0.01 - RADIUS * FLEXION, abs=2e-5)
     assert rolled[:, 1] == pytest.approx(DEPTH + RADIUS, abs=2e-6)
-    slipped = roll_slip_motion(roller, bed(False), 0.0, given, RADIUS * FLEXION)
+    slipped = roll_slip_motion(roller, bed(False), 0.0, original, RADIUS * FLEXION)
     assert slipped[:, 0] == pytest.approx(0.01, abs=2e-5)
 
 
 def test_slip_beside_the_insert_is_nan(roller: Surface) -> None:
-    moved = motion(np.linspace(0.0, -0.05, FRAMES), FLEXION)
-    medial, _ = both(condyle_slip(roller, bed(False), 0.0, moved))
+    coordinates = motion(np.linspace(0.0, -0.05, FRAMES), FLEXION)
+    medial, _ = both(condyle_slip(roller, bed(False), 0.0, coordinates))
     assert np.isfinite(medial.slip[:30]).all()
     assert np.isnan(medial.slip[-1])
 
 
-def test_profile_of_the_trough() -> None:
+def test_profile_of_the_trough_has_its_closed_form() -> None:
     x = np.linspace(-0.02, 0.02, 9)
     height, slope = InsertProfile(bed(True)).at(np.column_stack([x, x, 0.01 + 0 * x]))
     assert height == pytest.approx(DEPTH + TROUGH - np.sqrt(TROUGH**2 - x**2), abs=1e-6)
@@ -206,8 +206,8 @@ def test_arcs_agree_with_the_exact_sections() -> None:
     assert side.femoral_arc[-1] == pytest.approx(section, rel=5e-3)
     ahead = points[:-1] * [1.0, 1.0, 0.0] + points[0] * [0.0, 0.0, 1.0]
     behind = points[1:] * [1.0, 1.0, 0.0] + points[0] * [0.0, 0.0, 1.0]
-    travelled = arc_lengths(case.insert, ahead, behind).sum()
-    assert np.abs(np.diff(side.insert_arc)).sum() == pytest.approx(travelled, rel=5e-3)
+    path_length = arc_lengths(case.insert, ahead, behind).sum()
+    assert np.abs(np.diff(side.insert_arc)).sum() == pytest.approx(path_length, rel=5e-3)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -73,10 +73,10 @@ def test_a_given_displacement_spreads_as_in_the_undeformed_lattice(prepared, hel
     displacement = held.spread(prescribed).ravel()
     assert (displacement[held.unknowns] == prescribed).all()
     free, stiffness = ~held.held, solid.stiffness
-    of_held = np.zeros(solid.nodes.size)
-    of_held[held.unknowns] = prescribed
+    boundary_field = np.zeros(solid.nodes.size)
+    boundary_field[held.unknowns] = prescribed
     matrix = stiffness[free][:, free].tocsc()
-    exact = sparse_linalg.spsolve(matrix, -(stiffness @ of_held)[free])
+    exact = sparse_linalg.spsolve(matrix, -(stiffness @ boundary_field)[free])
     assert displacement[free] == pytest.approx(exact, abs=1e-5 * np.abs(prescribed).max())
     unit = np.zeros(solid.nodes.size)
     unit[held.unknowns] = -1.0

@@ -1,4 +1,4 @@
-"""Questions about a walking foot: every step is measured, and loads it alike."""
+"""Questions about a walking foot: steps without a measured force, and steps of unequal loads."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,28 +19,28 @@ MODELS = Path(__file__).parents[1] / "models"
 
 
 def walk(*gains, until=None, swing=4.0):
-    """Return a case with the given gain of the force in each stance, and the ankle's speed."""
+    """Return a case with a gain of the force in each stance, and the ankle's speed in swing."""
     upward, speed = np.zeros(len(TIME)), np.full(len(TIME), swing)
     for (begin, end), gain in zip(STANCES, gains, strict=True):
-        here = (begin < TIME) & (end > TIME)
-        upward[here] = gain * PEAK * np.sin(np.pi * (TIME[here] - begin) / (end - begin))
-        speed[here] = 0.1
-    kept = slice(None) if until is None else slice(0, int(np.searchsorted(TIME, until)))
+        stance = (begin < TIME) & (end > TIME)
+        upward[stance] = gain * PEAK * np.sin(np.pi * (TIME[stance] - begin) / (end - begin))
+        speed[stance] = 0.1
+    recorded = slice(None) if until is None else slice(0, int(np.searchsorted(TIME, until)))
     none = np.zeros(len(TIME))
     return SimpleNamespace(
-        ground=SimpleNamespace(force=np.column_stack([none, upward, none])[kept]),
-        tibia=SimpleNamespace(velocity=np.column_stack([speed, *5 * [none]])[kept]),
-        motion=SimpleNamespace(time=TIME[kept]),
+        ground=SimpleNamespace(force=np.column_stack([none, upward, none])[recorded]),
+        tibia=SimpleNamespace(velocity=np.column_stack([speed, *5 * [none]])[recorded]),
+        motion=SimpleNamespace(time=TIME[recorded]),
         body_weight=WEIGHT,
     )
 
 
-def test_steps_that_are_all_measured_are_asked_nothing():
+def test_measured_steps_raise_no_question():
     assert list(step_questions(walk(1.0, 1.05))) == []
-    assert list(step_questions(walk(1.0, 0.0, swing=0.2))) == []  # no walk: the leg is lifted
+    assert list(step_questions(walk(1.0, 0.0, swing=0.2))) == []  # The leg is lifted, not walking.
 
 
-def test_a_step_beside_the_plates_is_asked_about_in_its_frames():
+def test_a_step_beside_the_plates_raises_a_question_about_its_frames():
     (question,) = step_questions(walk(1.0, 0.0))
     assert "without a measured force" in question.text and question.flag
     assert {k for k in range(len(TIME)) if question.concerns(k)} == set(
@@ -51,7 +51,7 @@ def test_a_step_beside_the_plates_is_asked_about_in_its_frames():
 def test_a_plate_with_half_the_gain_is_asked_about():
     (question,) = step_questions(walk(0.5, 1.0))
     assert "one step loads the foot with 375 N" in question.text and "gain" in question.text
-    assert list(step_questions(walk(1.0, 0.5, until=1.3))) == []  # cut off on its way up
+    assert list(step_questions(walk(1.0, 0.5, until=1.3))) == []  # The second step is incomplete.
 
 
 @needs_jw

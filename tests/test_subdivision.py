@@ -22,7 +22,7 @@ LINEAR = material("polyethylene-linear")
 
 
 def halved(surface, times=1, seed=None):
-    """Return the surface with triangles divided into four; with a seed shuffled and rounded."""
+    """Return the surface with triangles divided into four; a seed shuffles and rounds them."""
     points, faces = surface.vertices, surface.faces
     for _ in range(times):
         points, faces = trimesh.remesh.subdivide(points, faces)
@@ -45,16 +45,16 @@ def ball(subdivisions=4):
 @pytest.mark.parametrize("seed", [None, 5])
 def test_flat_subdivision_is_undone(times, seed):
     """All coarser triangles are recovered, with the position of each finer triangle."""
-    whole = box_insert(20e-3, 8e-3, 30e-3)
-    for surface in (whole, ball(2)):
+    box = box_insert(20e-3, 8e-3, 30e-3)
+    for surface in (box, ball(2)):
         finer = halved(surface, times, seed)
         result = coarsened(finer)
         assert len(result.surface.faces) == len(surface.faces)
         assert result.surface.mesh.volume == pytest.approx(surface.mesh.volume, rel=1e-5)
         corners = np.einsum("kij,kjl->kil", result.corners, result.surface.triangles[result.parent])
         assert np.abs(corners - finer.triangles).max() < 1e-7
-        again = np.sort(np.bincount(result.parent))
-        assert (again == 4**times).all()
+        children = np.sort(np.bincount(result.parent))
+        assert (children == 4**times).all()
 
 
 def test_only_flat_subdivisions_are_undone():
@@ -62,11 +62,11 @@ def test_only_flat_subdivisions_are_undone():
     shape.
     """
     one, other = ball(2), halved(ball(2))
-    both = Surface(
+    spheres = Surface(
         np.vstack([one.vertices, other.vertices + 0.1]),
         np.vstack([one.faces, other.faces + len(one.vertices)]),
     )
-    assert len(coarsened(both).surface.faces) == 2 * len(one.faces)
+    assert len(coarsened(spheres).surface.faces) == 2 * len(one.faces)
     assert coarsened(one) is None
     assert coarsened(ball(3)) is None
     assert coarsened(condyles(subdivisions=3)) is None

@@ -29,7 +29,7 @@ def written(folder, name, text):
     return path
 
 
-def test_csv_with_comments_and_spaces(tmp_path):
+def test_a_csv_with_comments_and_spaces_is_read(tmp_path):
     table = read_table(written(tmp_path, "a.csv", "# run 3\ntime, angle\n0,1\n\n0.5, 2e0\n"))
     np.testing.assert_array_equal(table.time(), [0, 0.5])
     np.testing.assert_array_equal(table.complete_column("angle"), [1, 2])
@@ -94,7 +94,7 @@ def test_equal_columns_are_refused_only_where_one_is_needed(tmp_path):
         table.column("arm")
 
 
-def test_missing_file():
+def test_a_missing_file_is_refused():
     with pytest.raises(InputError, match="no such file"):
         read_table("nowhere.csv")
 
@@ -116,7 +116,7 @@ def test_time_must_rise(tmp_path, times, message):
         table.time()
 
 
-def test_gap_in_a_needed_column(tmp_path):
+def test_a_gap_in_a_needed_column_is_refused(tmp_path):
     table = read_table(written(tmp_path, "a.csv", "time,x\n0,1\n1,\n2,nan\n"))
     with pytest.raises(InputError, match=r"2 missing or non-finite.*row 2"):
         table.complete_column("x")
@@ -138,7 +138,7 @@ def test_units_must_be_stated_and_agree(tmp_path):
 
 
 def test_a_format_is_one_reader_and_one_row(tmp_path, monkeypatch):
-    """A toy format of `name: numbers` lines carries a whole scene's motion, by its suffix."""
+    """A new reader, for lines of `name: numbers`, is chosen by the suffix or by `format`."""
 
     def read_toy(path):
         lines = [line.split(":") for line in path.read_text(encoding="utf-8").splitlines()]

@@ -43,7 +43,7 @@ def trc(folder, labels, axes=AXES, rows=ROWS, counts=COUNTS):
 )
 @pytest.mark.parametrize("rows", [ROWS, BLANK_ROWS], ids=["tabs", "blanks"])
 @pytest.mark.parametrize("counts", [COUNTS, "  100.0   100.0   3  2 mm "], ids=["tabs", "blanks"])
-def test_blanks_for_tabs_in_a_trc(tmp_path, labels, rows, counts):
+def test_a_trc_with_blanks_instead_of_tabs_is_read(tmp_path, labels, rows, counts):
     table = trc(tmp_path, labels, rows=rows, counts=counts)
     assert table.length_unit == "mm" and table.notices == ()
     np.testing.assert_array_equal(table.column("R.Heel_x"), [1.0, 1.5, 2.0])
@@ -60,7 +60,6 @@ def storage(folder, rows="2", degrees="yes", more="", encoding="utf-8"):
 
 
 def test_a_header_that_states_another_number_of_rows_is_noticed(tmp_path):
-    """A file with fewer rows than its header states is read with a notice."""
     assert storage(tmp_path).notices == ()
     for rows in ("1", "5"):
         (notice,) = storage(tmp_path, rows).notices
@@ -73,12 +72,12 @@ def test_a_header_that_states_another_number_of_rows_is_noticed(tmp_path):
 @pytest.mark.parametrize(
     ("word", "degrees"), [("yes", True), ("TRUE", True), ("0", False), ("No", False), ("?", None)]
 )
-def test_words_for_degrees(tmp_path, word, degrees):
+def test_several_words_for_degrees_are_read(tmp_path, word, degrees):
     assert storage(tmp_path, degrees=word).in_degrees is degrees
 
 
 @pytest.mark.parametrize("encoding", ["latin-1", "utf-8", "utf-8-sig", "utf-16"])
-def test_bytes_of_remarks_that_are_no_numbers_refuse_no_table(tmp_path, encoding):
+def test_remarks_in_any_encoding_are_accepted(tmp_path, encoding):
     table = storage(tmp_path, more="gemessen für Müller, 20 °C\n", encoding=encoding)
     np.testing.assert_array_equal(table.column("knee"), [1.0, 2.0])
 
@@ -88,7 +87,7 @@ def test_a_storage_file_of_vectors_is_refused_as_such(tmp_path):
         storage(tmp_path, more="DataType=Vec3\n")
 
 
-def test_quoted_cells_of_a_csv(tmp_path):
+def test_quoted_cells_of_a_csv_are_read(tmp_path):
     (tmp_path / "a.csv").write_text('"time","x"\n"0","1.5"\n"0.1","2"\n', encoding="utf-8")
     np.testing.assert_array_equal(read_table(tmp_path / "a.csv").column("x"), [1.5, 2.0])
 
@@ -128,7 +127,7 @@ def test_labels_that_are_too_few_for_their_columns_are_refused_with_both_numbers
 
 
 @pytest.mark.parametrize("word", ["mm", "MM", "Millimeters", "m", "Meters", "cm"])
-def test_unit_words_of_a_trc(tmp_path, word):
+def test_unit_words_of_a_trc_are_read(tmp_path, word):
     unit = {"m": "mm", "M": "mm"}[word[0]] if word.lower().startswith(("mm", "mill")) else word[0]
     unit = {"m": "m", "M": "m", "c": "cm"}.get(unit, unit)
     labels = "Frame#\tTime\tA\t\t\tB\t\t"
@@ -144,7 +143,7 @@ def test_unit_words_of_a_trc(tmp_path, word):
         ("a.mot", "endheader\ntime\tx\n0.01\t2\t3\n", "give every column a name"),
     ],
 )
-def test_decimal_commas_are_guessed_only_where_they_may_be(tmp_path, name, text, words):
+def test_an_error_names_decimal_commas_only_if_they_are_possible(tmp_path, name, text, words):
     (tmp_path / name).write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=words):
         read_table(tmp_path / name)
@@ -177,15 +176,20 @@ def force_table(folder, columns):
 def test_moments_are_found_by_the_name_of_their_force(tmp_path, force):
     point = force.replace("v{}", "p{}").replace("F{}", "P{}").replace("f1", "p1")
     names = [p.format(a) for p in (force, point, FORCES[force]) for a in "xyz"]
-    (found,) = table_forces(force_table(tmp_path, dict.fromkeys(names, 1.0)))
+    (force_columns,) = table_forces(force_table(tmp_path, dict.fromkeys(names, 1.0)))
     roles = [f"{kind}_{k}" for kind in ("force", "point", "moment") for k in (1, 2, 3)]
-    assert found.columns == dict(zip(roles, names, strict=True))
+    assert force_columns.columns == dict(zip(roles, names, strict=True))
 
 
 def test_one_axis_of_the_moment_alone_is_used(tmp_path):
     names = [f"ground_force_{kind}{a}" for kind in "vp" for a in "xyz"]
-    (found,) = table_forces(force_table(tmp_path, dict.fromkeys([*names, "ground_torque_y"], 1.0)))
-    assert found.moments == ("ground_torque_y",) and found.columns["moment_2"] == "ground_torque_y"
+    (force_columns,) = table_forces(
+        force_table(tmp_path, dict.fromkeys([*names, "ground_torque_y"], 1.0))
+    )
+    assert (
+        force_columns.moments == ("ground_torque_y",)
+        and force_columns.columns["moment_2"] == "ground_torque_y"
+    )
 
 
 @pytest.mark.parametrize(
@@ -207,18 +211,20 @@ def two_forces(tmp_path, moments=True, at="pressure", rate=60.0, span=(0.0, 1.0)
     """Write a table of two forces: number 2 under the foot, number 1 a metre beside it."""
     time = np.arange(span[0], span[1], 1.0 / rate)
     foot = foot_path(tmp_path)
-    own = np.stack([np.interp(time, np.arange(60) / 60.0, foot[:, k]) for k in range(3)], axis=1)
-    own[:, 1] = 0.0
+    foot_point = np.stack(
+        [np.interp(time, np.arange(60) / 60.0, foot[:, k]) for k in range(3)], axis=1
+    )
+    foot_point[:, 1] = 0.0
     force = np.stack([20 * np.sin(6 * time), 400 + 50 * np.cos(5 * time), 0 * time + 8.0], axis=1)
     columns = {"time": time}
-    for number, point in ((1, own + np.array([0.0, 0.0, 1.0])), (2, own)):
+    for number, point in ((1, foot_point + np.array([0.0, 0.0, 1.0])), (2, foot_point)):
         moment = np.zeros_like(force)
         moment[:, 1] = 4.0 if moments else 0.0
         place = point
         if at != "pressure":
             place = np.zeros_like(point)
             if at == "plate":
-                place = place + own[30] + [0.05, 0.0, 0.02]
+                place = place + foot_point[30] + [0.05, 0.0, 0.02]
             moment = moment + np.cross(point - place, force)
         for k, axis in enumerate("xyz"):
             columns[f"ground_force_{number}_v{axis}"] = force[:, k]
@@ -230,8 +236,8 @@ def two_forces(tmp_path, moments=True, at="pressure", rate=60.0, span=(0.0, 1.0)
 
 
 @pytest.mark.parametrize("at", ["pressure", "plate", "file"])
-def test_a_tables_force_is_matched_to_the_foot_by_where_it_acts(tmp_path, capsys, at):
-    """At the centre of pressure, at the plate's origin, or at the file's: one wrench."""
+def test_a_tables_force_is_assigned_to_the_foot_at_its_point_of_application(tmp_path, capsys, at):
+    """Forces at the centre of pressure, the plate's origin or the file's origin give one wrench."""
     arguments = recorded_leg(tmp_path)
     assert main(changed(arguments, grf=two_forces(tmp_path, at=at))) == 0
     assert "ground_force_2_v*" in capsys.readouterr().out
@@ -244,10 +250,10 @@ def test_a_tables_force_is_matched_to_the_foot_by_where_it_acts(tmp_path, capsys
 def test_several_forces_under_one_foot_are_summed(tmp_path):
     arguments = recorded_leg(tmp_path)
     path = two_forces(tmp_path)
-    both = changed(arguments, grf=path, grf_force="ground_force_1,ground_force_2")
-    assert main(both) == 2  # they act half a metre from the ankle together
-    one = changed(arguments, grf=path, grf_force="ground_force_2")
-    assert main(one) == 0
+    arguments_of_two = changed(arguments, grf=path, grf_force="ground_force_1,ground_force_2")
+    assert main(arguments_of_two) == 2  # Their sum acts half a metre from the ankle.
+    single = changed(arguments, grf=path, grf_force="ground_force_2")
+    assert main(single) == 0
     case = load_case(load_scene(tmp_path / "out" / "scene.toml"))
     table = read_table(tmp_path / "g.mot")
     halved = dict(table.columns)
@@ -259,39 +265,39 @@ def test_several_forces_under_one_foot_are_summed(tmp_path):
             if "_v" in name or "_m" in name.partition("_1")[2]:
                 halved[name] = halved[name] / 2
     write_storage(tmp_path / "halves.mot", halved, in_degrees=False)
-    both = changed(
+    arguments_of_two = changed(
         arguments,
         grf=str(tmp_path / "halves.mot"),
         grf_force="ground_force_1,ground_force_2",
         out=str(tmp_path / "sum"),
     )
-    assert main(both) == 0
+    assert main(arguments_of_two) == 0
     summed = load_case(load_scene(tmp_path / "sum" / "scene.toml"))
     np.testing.assert_allclose(summed.ground.force, case.ground.force, atol=1e-5)
     np.testing.assert_allclose(summed.ground.moment, case.ground.moment, atol=1e-5)
 
 
 @pytest.mark.parametrize("span", [(0.0009, 0.99), (0.1, 0.8), (-0.3, 0.7)])
-def test_clocks_that_begin_and_end_apart_are_joined_where_both_run(tmp_path, capsys, span):
+def test_only_the_common_time_of_motion_and_force_is_used(tmp_path, capsys, span):
     arguments = recorded_leg(tmp_path)
     path = two_forces(tmp_path, rate=600.0, span=span)
-    given = changed(arguments, grf=path, grf_force="ground_force_2")
-    assert main(given) == 0
+    arguments = changed(arguments, grf=path, grf_force="ground_force_2")
+    assert main(arguments) == 0
     assert "ATTENTION: the ground reaction was recorded from" in capsys.readouterr().out
     text = (tmp_path / "out" / "scene.toml").read_text()
     time = load_case(load_scene(tmp_path / "out" / "scene.toml")).motion.time
     assert time[0] >= span[0] and time[-1] <= span[1] and np.ptp(time) > 0.5
-    # a scene that states no interval: the same part, by itself
+    # Without an interval in the scene, the common part is used too.
     whole = "\n".join(line for line in text.splitlines() if "interval_s" not in line)
     (tmp_path / "out" / "scene.toml").write_text(whole)
     time = load_case(load_scene(tmp_path / "out" / "scene.toml")).motion.time
     assert time[0] >= span[0] and time[-1] <= span[1] and np.ptp(time) > 0.5
 
 
-def test_clocks_without_a_common_part_are_refused_with_both(tmp_path, capsys):
+def test_files_without_a_common_time_are_refused(tmp_path, capsys):
     path = two_forces(tmp_path, span=(5.0, 6.0))
-    given = changed(recorded_leg(tmp_path), grf=path, grf_force="ground_force_2")
-    assert main(given) == 2
+    arguments = changed(recorded_leg(tmp_path), grf=path, grf_force="ground_force_2")
+    assert main(arguments) == 2
     assert "give files of one trial" in capsys.readouterr().err
 
 
@@ -301,8 +307,10 @@ def test_clocks_without_a_common_part_are_refused_with_both(tmp_path, capsys):
 def twice_prefixed(tmp_path):
     arguments = recorded_leg(tmp_path)
     _, markers = moving_leg(tmp_path / "plain.osim")
-    both = {f"{who}:{name}": path for who in ("S", "Model") for name, path in markers.items()}
-    write_trc(tmp_path / "leg.trc", np.arange(60) / 60.0, both, 60.0)
+    arguments_of_two = {
+        f"{who}:{name}": path for who in ("S", "Model") for name, path in markers.items()
+    }
+    write_trc(tmp_path / "leg.trc", np.arange(60) / 60.0, arguments_of_two, 60.0)
     return arguments
 
 
@@ -314,7 +322,7 @@ def test_markers_under_two_prefixes_ask_which(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("prefix", ["S", "Model", "Model:"])
-def test_the_prefix_that_is_given_is_taken(tmp_path, prefix):
+def test_only_markers_with_the_requested_prefix_are_used(tmp_path, prefix):
     assert main(changed(twice_prefixed(tmp_path), marker_prefix=prefix)) == 0
     text = (tmp_path / "out" / "scene.toml").read_text()
     other = "Model:" if prefix == "S" else "S:"
@@ -323,7 +331,7 @@ def test_the_prefix_that_is_given_is_taken(tmp_path, prefix):
     assert case.motion.markers.rms["segments"].max() < 1e-5
 
 
-def test_a_prefix_that_is_not_there_is_refused_with_those_that_are(tmp_path, capsys):
+def test_an_unknown_prefix_is_refused_with_the_existing_ones(tmp_path, capsys):
     assert main(changed(twice_prefixed(tmp_path), marker_prefix="Static")) == 2
     assert "its prefixes: S, Model" in capsys.readouterr().err
 
@@ -342,8 +350,8 @@ def test_a_states_files_speeds_are_no_coordinates(tmp_path, path, turned):
     q, missing = read_coordinates(chain, table)
     np.testing.assert_allclose(q[:, chain.coordinates["knee_flexion_r"]], [0.1, 0.2, 0.3])
     assert "knee_flexion_r" not in missing
-    alone = Table(tmp_path / "q.sto", {"time": np.arange(3.0), **speed}, in_degrees=False)
-    assert "knee_flexion_r" in read_coordinates(chain, alone)[1]
+    speeds_only = Table(tmp_path / "q.sto", {"time": np.arange(3.0), **speed}, in_degrees=False)
+    assert "knee_flexion_r" in read_coordinates(chain, speeds_only)[1]
 
 
 @pytest.mark.parametrize(
@@ -379,16 +387,16 @@ def motion_of_the_leg(tmp_path):
     q, _ = moving_leg(osim)
     columns = {name: q[:, k] for k, name in enumerate(read_osim(osim).coordinates)}
     write_storage(tmp_path / "leg.mot", {"time": np.arange(60) / 60.0} | columns, in_degrees=False)
-    given = ["--motion", str(tmp_path / "leg.mot"), "--side", "right", "--mass-kg", "53.5"]
-    return ["import", str(osim), *given, "--out", str(tmp_path / "out")]
+    arguments = ["--motion", str(tmp_path / "leg.mot"), "--side", "right", "--mass-kg", "53.5"]
+    return ["import", str(osim), *arguments, "--out", str(tmp_path / "out")]
 
 
-def test_a_motion_and_a_force_that_lasts_less_are_joined(tmp_path, capsys):
-    """The foot is where the model's coordinates have it; the force is matched to it."""
+def test_a_motion_is_cut_to_the_time_of_its_force(tmp_path, capsys):
+    """The model's coordinates give the foot's position, to which the force is assigned."""
     arguments = motion_of_the_leg(tmp_path)
     assert main([*arguments, "--grf", two_forces(tmp_path, span=(-0.5, 0.6))]) == 0
-    said = capsys.readouterr().out
-    assert "ground_force_2_v*" in said and "by where they act" in said
+    output = capsys.readouterr().out
+    assert "ground_force_2_v*" in output and "by their points of application" in output
     time = read_table(tmp_path / "out" / "motion.csv").column("time_s")
     assert time[0] == 0.0 and 0.5 < time[-1] <= 0.6
 

@@ -34,7 +34,7 @@ def test_both_returns_the_results_also_in_nested_calls(with_threads, count):
         return threads.both(lambda: 3, lambda: 4)
 
     assert threads.both(nested, nested) == ((3, 4), (3, 4))
-    assert threads.in_halves(lambda some: list(range(9))[some], 9) == (
+    assert threads.in_halves(lambda chosen: list(range(9))[chosen], 9) == (
         [0, 1, 2, 3],
         [4, 5, 6, 7, 8],
     )
@@ -97,41 +97,41 @@ def test_a_press_does_not_depend_on_the_number_of_threads(with_threads, name):
         with_threads(count)
         model = contact_model(name, 2.0)
         result.append(model.press(model.prepare(bodies), 2000.0, pose))
-    one, two = result
-    assert one.status is two.status is ContactStatus.OK
-    assert one.pose.tobytes() == two.pose.tobytes()
-    assert one.pressure.tobytes() == two.pressure.tobytes()
-    assert (one.pressure > 0).any()
+    single, double = result
+    assert single.status is double.status is ContactStatus.OK
+    assert single.pose.tobytes() == double.pose.tobytes()
+    assert single.pressure.tobytes() == double.pressure.tobytes()
+    assert (single.pressure > 0).any()
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_the_two_shares_of_fronts_are_independent(seed):
     """For any forest the two shares depend neither on each other nor on the fronts above."""
-    chance = np.random.default_rng(seed)
-    count = int(chance.integers(1, 80))
-    parents = [int(chance.integers(i + 1, min(i + 12, count) + 1)) for i in range(count)]
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(1, 80))
+    parents = [int(rng.integers(i + 1, min(i + 12, count) + 1)) for i in range(count)]
     parents = np.array([-1 if parent == count else parent for parent in parents])
-    sizes = chance.integers(1, 40, count)
+    sizes = rng.integers(1, 40, count)
     starts = np.cumsum([0, *sizes])
     empty = np.zeros(0, np.int64)
     factor = CholeskyFactor(
         empty, starts, parents, np.zeros(count + 1, np.int64), empty, np.zeros(0), np.zeros(0)
     )
-    some = np.flatnonzero(chance.random(count) < chance.choice([0.3, 0.9, 1.0]))
-    shares = factor.shared(some)
-    assert (shares.fronts == some).all()
-    whose = np.full(count, -1)
+    chosen = np.flatnonzero(rng.random(count) < rng.choice([0.3, 0.9, 1.0]))
+    shares = factor.shared(chosen)
+    assert (shares.fronts == chosen).all()
+    share_of = np.full(count, -1)
     for number, own in enumerate((shares.first, shares.second, shares.above)):
-        whose[own] = number
-    for front in some.tolist():
+        share_of[own] = number
+    for front in chosen.tolist():
         above = parents[front]
         while above >= 0:
-            if whose[above] >= 0:
-                assert whose[above] in (whose[front], 2)
+            if share_of[above] >= 0:
+                assert share_of[above] in (share_of[front], 2)
             above = parents[above]
     weight = np.diff(factor.firsts)
     loads = [weight[own].sum() for own in (shares.first, shares.second, shares.above)]
-    assert loads[2] + max(loads[:2]) <= weight[some].sum()
+    assert loads[2] + max(loads[:2]) <= weight[chosen].sum()
 
 
 def test_a_balanced_tree_is_divided_in_two_halves():

@@ -70,7 +70,7 @@ def test_markers_give_pose_and_rates(tmp_path):
     np.testing.assert_allclose(tibia.velocity[:, 3:], spin, atol=2e-3)
 
 
-def test_laboratory_axes_of_a_walk_towards_minus_x(tmp_path):
+def test_laboratory_axes_turn_a_walk_towards_minus_x(tmp_path):
     backwards = pose(np.diag([-1.0, 1.0, -1.0]), np.zeros(3)) @ shank(STAMPS)
     file = marker_file(tmp_path / "s.trc", backwards)
     tibia = load_tibia(marker_table(file, laboratory_axes="-x,+y,-z"), AT, "right", "none")
@@ -103,23 +103,25 @@ def test_the_ankle_centre_replaces_a_missing_marker(tmp_path):
     ankle_in_foot = np.array([10.0, 30.0, -5.0])
     flex = Rotation.from_euler("ZX", np.stack([np.sin(5 * STAMPS), 0.2 * STAMPS], 1)).as_matrix()
     turned = shank(STAMPS) @ pose(flex, np.zeros(3)) @ pose(np.eye(3), -ankle_in_foot * 1e-3)
-    two = {name: MARKERS[name] for name in ("lower", "front")}
+    shank_markers = {name: MARKERS[name] for name in ("lower", "front")}
     points = [
         transform(poses, np.broadcast_to(np.array(list(m.values())) * 1e-3, (241, len(m), 3)))
-        for poses, m in ((shank(STAMPS), two), (turned, foot))
+        for poses, m in ((shank(STAMPS), shank_markers), (turned, foot))
     ]
-    file = write_trc(tmp_path / "s.trc", np.concatenate(points, axis=1) * 1e3, [*two, *foot])
+    file = write_trc(
+        tmp_path / "s.trc", np.concatenate(points, axis=1) * 1e3, [*shank_markers, *foot]
+    )
     ankle = JointCentreTable(
         name="ankle", markers_mm=foot, centre_mm=tuple(ankle_in_foot), tibia_mm=(0, 0, 0)
     )
-    table = marker_table(file, markers_mm=two, joint_centre=(ankle,))
+    table = marker_table(file, markers_mm=shank_markers, joint_centre=(ankle,))
     tibia = load_tibia(table, AT, "right", "none")
     np.testing.assert_allclose(tibia.pose, shank(AT), atol=1e-8)
     with pytest.raises(InputError, match="markers of the tibia fix no orientation"):
-        load_tibia(marker_table(file, markers_mm=two), AT, "right", "none")
+        load_tibia(marker_table(file, markers_mm=shank_markers), AT, "right", "none")
 
 
-def test_columns_of_poses(tmp_path):
+def test_columns_of_poses_are_read(tmp_path):
     poses = shank(STAMPS)
     angles = Rotation.from_matrix(poses[:, :3, :3]).as_euler("ZXY", degrees=True)
     names = ["time", *(f"{w}_{k}" for w in ("rotation", "translation") for k in (1, 2, 3))]
@@ -181,7 +183,7 @@ def test_a_gap_outside_the_interval_has_no_influence(tmp_path):
         load_tibia(marker_table(file), AT + 0.3, "right", "none")
 
 
-def test_refusals(tmp_path):
+def test_contradictory_marker_tables_are_refused(tmp_path):
     file = marker_file(tmp_path / "s.trc", shank(STAMPS))
     with pytest.raises(InputError, match="no column 'uper_x'; did you mean upper_x"):
         load_tibia(

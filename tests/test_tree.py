@@ -14,7 +14,7 @@ from tkamb.geometry.surface import Surface
 
 DOWN = (0.0, -1.0, 0.0)
 NONE = np.array([[np.nan, 0.0, 0.0], [0.0, np.nan, 0.0], [0.0, 0.0, np.inf], [-np.inf, 0.0, 0.0]])
-"""Points that are none."""
+"""Points that are not finite."""
 WALL = [
     -0.013631006651548021,
     0.0031447617921752657,
@@ -37,11 +37,11 @@ SLIVER = [
     0.009999999999999998,
     -0.021473476494820253,
 ]
-"""Corners, m: both upright and level along one line, to within the rounding of coordinates."""
+"""Corners, m, of an upright and a level triangle along one line, to within rounding."""
 
 
 def ribbon(count):
-    """Return that number of triangles in a row along x, in this order."""
+    """Return a strip of `count` triangles, in order along x."""
     x = np.arange(count + 2.0)
     corners = np.stack([x, 0.0 * x, x % 2], axis=1)
     first = np.arange(count)[:, None]
@@ -93,31 +93,31 @@ def test_a_side_without_a_triangle_does_not_touch():
 def test_cuts_of_slivers_fit_into_the_work_array():
     """A wall along a sliver: by rounding its corners lie on either side of each edge."""
     wall, sliver = np.ravel(WALL), np.ravel(SLIVER)
-    room = np.full((2, MOST_CORNERS + 8, 3), np.pi)
+    buffers = np.full((2, MOST_CORNERS + 8, 3), np.pi)
     plane = first_touch._plane(sliver)
-    work = room[0, :MOST_CORNERS], room[1, :MOST_CORNERS]
+    work = buffers[0, :MOST_CORNERS], buffers[1, :MOST_CORNERS]
     first_touch._over_each_other(wall, sliver, plane, np.inf, *work, np.empty(3))
-    assert (room[:, MOST_CORNERS - 1] != np.pi).any(), "not as many corners as there can be"
-    assert (room[:, MOST_CORNERS:] == np.pi).all()
+    assert (buffers[:, MOST_CORNERS - 1] != np.pi).any(), "fewer corners than the maximum"
+    assert (buffers[:, MOST_CORNERS:] == np.pi).all()
 
 
 def test_other_array_types_do_not_trigger_compilation():
     ball = sphere(0.02, 2)
     points = np.zeros((4, 3))
-    asked = [lambda p: ball.rays.first(p, DOWN), lambda p: ball.rays.all(p, DOWN)]
-    asked += [lambda p: ball.rays.first(points, p), ball.nearest.at]
-    asked += [lambda p: ball.nearest.within(p, 1)]
+    queries = [lambda p: ball.rays.first(p, DOWN), lambda p: ball.rays.all(p, DOWN)]
+    queries += [lambda p: ball.rays.first(points, p), ball.nearest.at]
+    queries += [lambda p: ball.nearest.within(p, 1)]
     loops = rays._first_crossings, rays._all_crossings, nearest._nearest_points
     fixed = points + 0.0
     fixed.setflags(write=False)
     others = fixed, points.astype(np.float32), np.asfortranarray(points), points.tolist()
-    for ask in asked:
-        ask(points)
-    known = [set(loop.signatures) for loop in loops]
-    for ask in asked:
+    for query in queries:
+        query(points)
+    signatures_before = [set(loop.signatures) for loop in loops]
+    for query in queries:
         for other in others:
-            ask(other)
-    assert [set(loop.signatures) for loop in loops] == known
+            query(other)
+    assert [set(loop.signatures) for loop in loops] == signatures_before
 
 
 def test_sorted_triangles_are_divided_in_linear_time(monkeypatch):
@@ -141,14 +141,14 @@ def clearance(upper, lower):
     """Return the smallest clearance of two triangles, at corners and crossings of edges in plan
     view.
     """
-    apart = [*(upper[:, 1] - heights_over(upper, lower))]
-    apart += [*(heights_over(lower, upper) - lower[:, 1])]
+    clearances = [*(upper[:, 1] - heights_over(upper, lower))]
+    clearances += [*(heights_over(lower, upper) - lower[:, 1])]
     for i, j in np.ndindex(3, 3):
         (p, q), (r, s) = upper[[i, i - 1]], lower[[j, j - 1]]
         along, across = np.linalg.solve(np.stack([q - p, r - s], axis=1)[[0, 2]], (r - p)[[0, 2]])
         if min(along, across) >= 0.0 and max(along, across) <= 1.0:
-            apart.append(p[1] + along * (q - p)[1] - r[1] - across * (s - r)[1])
-    return np.nan_to_num(apart, nan=np.inf).min()
+            clearances.append(p[1] + along * (q - p)[1] - r[1] - across * (s - r)[1])
+    return np.nan_to_num(clearances, nan=np.inf).min()
 
 
 @settings(max_examples=40, deadline=None)

@@ -235,8 +235,8 @@ def test_a_resumed_analysis_with_two_workers_gives_the_bands_of_one(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--samples", "0"], "0 is not within 20"),
-        (["--workers", "0"], "0 is not within 1"),
+        (["--samples", "0"], "cannot be 0; give a number from 20"),
+        (["--workers", "0"], "cannot be 0; give a number from 1"),
         (["--method", "dice"], "unknown method 'dice'"),
         (["--set", "uncertainty.ap_mm=-1"], "greater than or equal to 0"),
         (["--set", "uncertainty.ap=1"], "unknown key 'uncertainty.ap'"),

@@ -93,14 +93,14 @@ def test_every_encoding_gives_the_same_body(mode, tmp_path):
         assert np.array_equal(vertices, (1e3 * BODY.vertices).astype("f4"))
 
 
-def test_what_the_project_writes_it_reads(tmp_path):
+def test_a_written_vtp_is_read_again(tmp_path):
     write_triangles(tmp_path / "part.vtp", BODY.vertices, BODY.faces, {})
     surface = load_surface(tmp_path / "part.vtp", "m", name="insert", closed=True)
     assert np.array_equal(surface.vertices, BODY.vertices)
     assert np.array_equal(surface.faces, BODY.faces)
 
 
-def test_polygons_become_fans(tmp_path):
+def test_polygons_are_divided_into_triangles(tmp_path):
     box = np.array([[x, y, z] for x in (0, 40) for y in (0, 10) for z in (0, 60.0)])
     sides = [0, 1, 3, 2, 4, 6, 7, 5, 0, 4, 5, 1, 2, 3, 7, 6, 0, 2, 6, 4, 1, 5, 7, 3]
     arrays = {"points": box, "connectivity": np.array(sides), "offsets": np.arange(4, 25, 4)}
@@ -146,7 +146,7 @@ def test_what_cannot_be_read_is_named(old, new, words, tmp_path):
     assert "\n" not in str(caught.value)
 
 
-def test_a_corner_that_is_no_point(tmp_path):
+def test_a_triangle_with_a_missing_point_is_refused(tmp_path):
     arrays = ARRAYS | {"connectivity": ARRAYS["connectivity"] + 1}
     with pytest.raises(InputError, match="corner that is no point"):
         read_triangles(written(tmp_path / "part.vtp", "raw", arrays=arrays))

@@ -175,7 +175,7 @@ def test_invalid_input_is_an_error_of_one_line(capsys, tmp_path, profile, scene)
         assert not out.exists()
     with pytest.raises(SystemExit, match="2"):
         main(["wear", str(scene), "--cycles", "1.5"])
-    assert "'1.5' is no whole number" in capsys.readouterr().err
+    assert "'1.5' is not a whole number" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -21,16 +21,16 @@ class ViscoelasticBed:
     """Columns of springs and dampers under a rigid femoral component, step by step.
 
     Each column of the bed (`tkamb.contact.samples`) has the linear foundation's pressure p = M d/h
-    with M relaxing as a Prony series. A column that the femur leaves carries nothing and creeps
-    back: its strain is then what makes its stress zero. The load acts along -y.
+    where M relaxes as a Prony series. A column out of contact carries nothing and recovers. Its
+    strain is then the strain at zero stress. The load acts along -y.
 
-    Limits: as the linear elastic foundation; one modulus, relaxing in volume and shape alike.
+    Limits: those of the linear elastic foundation; the bulk and the shear modulus relax alike.
 
     Args:
         bed: the sampled articular surface.
         femoral: the femoral component, in its own frame.
         modulus: M_0, Pa, instantaneous and confined.
-        series: its relaxation.
+        series: relaxation of the modulus.
     """
 
     def __init__(self, bed, femoral, modulus, series):
@@ -41,28 +41,28 @@ class ViscoelasticBed:
     def press(self, load, pose, step):
         """Advance by `step` s to a load (N) at a pose with free y; return the pressure (n,), Pa."""
 
-        def missing(fall):
-            result = self._pressed(pose, fall, step)[1]
+        def excess(descent):
+            result = self._pressed(pose, descent, step)[1]
             return float((result * self._bed.area) @ self._bed.normals[:, 1]) - load
 
-        fall = brentq(missing, -5e-3, 5e-3, xtol=1e-9)
-        strain, pressure = self._pressed(pose, fall, step)
+        descent = brentq(excess, -5e-3, 5e-3, xtol=1e-9)
+        strain, pressure = self._pressed(pose, descent, step)
         _, decay, remaining = self._series.response(step)
         self._memory = decay[:, None] * self._memory + remaining[:, None] * (strain - self._strain)
         self._strain = strain
         return pressure
 
-    def _pressed(self, pose, fall, step):
-        """Return strains and pressures (n,) after a move of the femur down by `fall` (m)."""
+    def _pressed(self, pose, descent, step):
+        """Return strains and pressures (n,) after a move of the femur down by `descent` (m)."""
         moved = np.array(pose, float)
-        moved[1, 3] -= fall
+        moved[1, 3] -= descent
         gap = gaps_along_normals(self._bed, self._femoral, moved)
-        asked = -gap / np.maximum(self._bed.thickness, FOUNDATION.least_thickness)
+        imposed = -gap / np.maximum(self._bed.thickness, FOUNDATION.least_thickness)
         slope, decay, remaining = self._series.response(step)
-        carried = decay @ self._memory - remaining.sum() * self._strain
-        free = -carried / slope  # strain at which the stress is zero
-        strain = np.maximum(asked, free)
-        return strain, self._modulus * np.maximum(slope * strain + carried, 0.0)
+        history = decay @ self._memory - remaining.sum() * self._strain
+        free = -history / slope  # strain at which the stress is zero
+        strain = np.maximum(imposed, free)
+        return strain, self._modulus * np.maximum(slope * strain + history, 0.0)
 
 
 SERIES = PronySeries((0.4, 0.3), (0.5, 20.0))
@@ -148,8 +148,8 @@ PAIR_SERIES = PronySeries((0.4, 0.2), (1.0, 20.0))
 def bonded(top, resolution=2e-3, modulus=500e6):
     """Return a block of 10 mm on the lattice, bonded at its bottom, under a rigid body."""
     plate = shapes.block(lambda x, z: 0.01 + 0 * x, 0.02, 0.012, 2e-3)
-    made_of = Material("m", modulus, 0.46)
-    pair = ContactPair(top, plate, made_of, "fixed")
+    polymer = Material("m", modulus, 0.46)
+    pair = ContactPair(top, plate, polymer, "fixed")
     return LinearLattice(resolution=resolution, cache=False), pair
 
 
@@ -176,8 +176,8 @@ def test_a_bonded_block_under_a_flat_plate_relaxes_by_the_series(flat):
     assert first == pytest.approx(-elastic(flat, held_at(0.1e-3)).nodal_force[:, 1].sum(), rel=1e-4)
 
 
-def elastic(made, place, share=1.0, load=None):
-    model, pair = made
+def elastic(model_and_pair, place, share=1.0, load=None):
+    model, pair = model_and_pair
     softer = replace(pair.material, young_modulus=share * pair.material.young_modulus)
     state = model.prepare(replace(pair, material=softer))
     return model.evaluate(state, place) if load is None else model.press(state, load, place)
@@ -200,9 +200,9 @@ def test_a_bonded_block_under_a_constant_load_creeps_by_the_reciprocal_of_the_se
 def test_the_unloaded_block_recovers_its_shape(flat):
     block = ViscoelasticLattice(*flat, PAIR_SERIES)
     block.hold(held_at(0.1e-3), 50.0)
-    left = block.hold(held_at(-1e-3), 1e-6)
-    assert not left.force.any()
-    assert left.displacement[:, 1].min() < -1e-5
+    released = block.hold(held_at(-1e-3), 1e-6)
+    assert not released.force.any()
+    assert released.displacement[:, 1].min() < -1e-5
     assert np.abs(block.hold(held_at(-1e-3), 1e4).displacement).max() < 1e-7
 
 
@@ -216,11 +216,11 @@ def rolled(ball):
     return {name: moved_on_lattice(ball, speed) for name, speed in SPEEDS.items()}
 
 
-def moved_on_lattice(made, speed):
+def moved_on_lattice(model_and_pair, speed):
     """Return last pressures and lead of a loaded sphere that moves 4 mm along x, in steps of 0.5
     mm.
     """
-    block = ViscoelasticLattice(*made, PronySeries((0.6,), (1.0,)))
+    block = ViscoelasticLattice(*model_and_pair, PronySeries((0.6,), (1.0,)))
     for place in np.arange(-2e-3, 2.1e-3, 5e-4):
         result = block.press(200.0, pose(np.eye(3), [place, 0, 0]), 5e-4 / speed)
     force = -result.force[:, 1]

@@ -71,7 +71,7 @@ def test_free_path_is_straight() -> None:
 
 
 @pytest.mark.parametrize("angle_deg", [-60.0, 0.0, 60.0, 120.0, 170.0, 200.0])
-def test_side_is_anterior_and_wrap_angle_is_the_turn(angle_deg: float) -> None:
+def test_the_string_passes_in_front_and_the_wrap_angle_is_its_turn(angle_deg: float) -> None:
     """The end moves clockwise from above the bone until it is behind the bone."""
     angle = np.pi / 2 - np.deg2rad(angle_deg)
     start = np.array([0.0, 0.2, 0.0])
@@ -81,7 +81,7 @@ def test_side_is_anterior_and_wrap_angle_is_the_turn(angle_deg: float) -> None:
     assert path.wrap_angle == pytest.approx(max(expected, 0.0), abs=3e-3)
 
 
-def test_unit_tension_balances_exactly() -> None:
+def test_the_forces_of_a_unit_tension_add_up_to_zero() -> None:
     for flexion in FLEXION[::20]:
         line = quadriceps()
         path = line.path(poses_at(float(flexion)))
@@ -89,7 +89,7 @@ def test_unit_tension_balances_exactly() -> None:
         assert np.abs(wrench).max() < 1e-14
 
 
-def test_reaction_presses_the_bone_without_friction() -> None:
+def test_the_reaction_presses_on_the_bone_without_friction() -> None:
     points = between("a", [0.0, 0.2, 0.02], "b", [0.0, -0.06, -0.01])
     line = Line("string", points, Wrap("bone", CIRCLE))
     reaction = line.loads(line.path(dict.fromkeys(("a", "b", "bone"), np.eye(4))))[2]
@@ -105,7 +105,7 @@ def test_the_force_at_a_via_point_acts_on_its_link() -> None:
     via = LinkPoint("shank", np.array([0.02, -0.09, 0.01]))
     start, end = between("hip", [-0.03, 0.3, 0.0], "shank", [0.0, -0.3, 0.02])
     origin = LinkPoint("femur", np.array([0.0, 0.2, 0.02]))
-    line = Line("string", (start, origin, via, end), Wrap("femur", CIRCLE, stretch=1))
+    line = Line("string", (start, origin, via, end), Wrap("femur", CIRCLE, segment=1))
     path = line.path(dict.fromkeys(("hip", "femur", "shank"), np.eye(4)))
     around = taut_path(origin.position, via.position, CIRCLE)
     assert around.wrapped
@@ -142,9 +142,9 @@ def test_moment_arm_is_derivative_of_length(coordinate: int) -> None:
         power = 0.0
         for load in line.loads(path):
             if load.link == "femur":
-                here = np.linalg.inv(knee_pose(q))
+                femur_inverse = np.linalg.inv(knee_pose(q))
                 for point, force in zip(load.points, load.forces, strict=True):
-                    material = here @ np.append(point, 1.0)
+                    material = femur_inverse @ np.append(point, 1.0)
                     power += (pose_rate @ material)[:3] @ force
         difference = (lengths[1] - lengths[0]) / (2 * step)
         scale = 0.03 if coordinate > 2 else 1.0
@@ -172,7 +172,7 @@ def test_moment_arm_has_no_jump_when_wrapping_starts() -> None:
     assert abs(arm(low) - arm(high)) < 1e-9
 
 
-def test_inside_start_is_refused() -> None:
+def test_a_start_inside_the_outline_is_refused() -> None:
     with pytest.raises(ComputationError, match="inside"):
         taut_path(np.zeros(3), np.array([0.1, 0.0, 0.0]), CIRCLE)
 
@@ -195,7 +195,7 @@ def test_section_of_a_cylinder_is_its_circle() -> None:
     assert perimeter == pytest.approx(2 * np.pi * 0.02, rel=1e-3)
 
 
-def test_outline_grows_by_the_tendon() -> None:
+def test_the_outline_is_offset_by_half_of_the_tendon() -> None:
     square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.5, 0.5]])
     grown = convex_outline(square, 0.1)
     edges = np.roll(grown, -1, axis=0) - grown
@@ -203,7 +203,7 @@ def test_outline_grows_by_the_tendon() -> None:
     assert area == pytest.approx(1.0 + 4 * 0.1 + np.pi * 0.01, rel=1e-4)
 
 
-def test_outline_stops_below_the_start() -> None:
+def test_the_outline_ends_at_the_given_height() -> None:
     mesh = trimesh.creation.box(extents=(0.02, 0.4, 0.04))
     surface = Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces), "shaft")
     outline = sagittal_outline([surface], [0.0], offset=0.002, below=0.1)

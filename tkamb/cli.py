@@ -70,6 +70,14 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         for kind, words in (("float", "is not a number"), ("int", "is not a whole number")):
             message = re.sub(rf"invalid {kind} value: ('.*')", rf"\1 {words}", message)
+        message = re.sub(
+            r"expected (\d+) arguments", r"give \1 values, with spaces between", message
+        )
+        message = re.sub(
+            r"argument ([\w, /-]*?)(--\w[\w-]*): expected one argument",
+            r"argument \1\2: has no value; write \2=VALUE if the value begins with -",
+            message,
+        )
         self.exit(2, f"{self.prog}: {' '.join(message.split())}; see {self.prog} --help\n")
 
 

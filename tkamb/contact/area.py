@@ -48,7 +48,7 @@ def covered_areas(
         points: (n, 3) m, nodes.
         triangles: (k, 3) nodes of each triangle.
         triangle_area: (k,) m².
-        pressure: (n,) Pa, force of a node over its tributary area; positive in contact.
+        pressure: (n,) Pa, nodal force divided by tributary area; positive in contact.
         gap: (n,) m, gap of the deformed body near the contact.
         material: material of the elastic body.
 
@@ -111,8 +111,8 @@ def area_above(points: Array, triangles: Index, pressure: Array, level: float) -
     """Return the area (m²) where the pressure exceeds a level.
 
     On each triangle q = p² is interpolated linearly between the corners. A constant is added: the
-    mean difference between a quadratic q and its linear interpolation. It is the sum over the edges
-    of (g_i - g_j).(x_j - x_i) / 24, with the gradients g of q at the corners. For a Hertzian
+    mean difference between a quadratic q and its linear interpolation. The constant is the sum over
+    the edges of (g_i - g_j).(x_j - x_i) / 24; g is the gradient of q at a corner. For a Hertzian
     pressure, where q is quadratic, the mean of q is exact. The area is a continuous function of the
     pressures.
 
@@ -187,7 +187,7 @@ def _shape(points: Array, corners: Index, edges: Array, across: Array) -> float:
 
 @compiled_as_written
 def _share_above(values: Array, level: float) -> float:
-    """Return the share of a triangle where linear values exceed a level; sort the values (3,)."""
+    """Return the share of a triangle above a level, from the corners' values (3,); sort them."""
     values.sort()
     low, middle, high = values[0], values[1], values[2]
     if level >= high:

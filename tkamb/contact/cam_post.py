@@ -313,7 +313,7 @@ def cam_of(femoral: Surface, split: float | None, reach: float) -> Surface:
     behind = femoral.triangles[:, :, 0].max(axis=1) < femoral.bounds[:, 0].mean()
     chosen = behind & (across.min(axis=1) < reach) & (across.max(axis=1) > -reach)
     if not chosen.any():
-        what = "the femoral component has no cam between its condyles"
-        raise InputError(what, WHERE, "leave the key out, or give the mesh with its cam")
+        problem = "the femoral component has no cam between its condyles"
+        raise InputError(problem, WHERE, "leave the key out, or give the mesh with its cam")
     used, faces = np.unique(femoral.faces[chosen], return_inverse=True)
     return Surface(femoral.vertices[used], faces.reshape(-1, 3).astype(np.int64), "cam")

@@ -22,8 +22,8 @@ class CurvatureSettings:
     """m: the contact point has converged when an iteration moves it by less. Chosen because it is
     far below the size of a triangle."""
     max_distance: float = 3.0
-    """1: largest distance of the contact point from first touch, over the radius of a patch.
-    Farther away the quadrics do not describe the surfaces."""
+    """1: largest distance of the contact point from first touch, in radii of the patch. Farther
+    away the quadrics do not describe the surfaces."""
     least_cover: float = 0.6
     """1: smallest share of a patch that both meshes must cover. With a smaller share the quadric
     is an extrapolation."""
@@ -63,9 +63,9 @@ def osculate(
 
     The patch is a disc in the tangent plane. Evenly spaced rays along the normal sample both
     meshes. A quadric z = c0 + c1 u + c2 v + c3 u² + c4 uv + c5 v² is fitted to each mesh by least
-    squares. Each iteration moves the disc to the minimum of the quadrics' difference, and turns it
-    to their mean normal there. Facets smaller than the disc average out. On a sphere of radius R
-    the relative error of the curvature is radius²/(4 R²), from the quartic term.
+    squares. Each iteration moves the disc to the minimum of the quadrics' difference, and aligns
+    its axis with the quadrics' mean normal. Facets smaller than the disc average out. On a sphere
+    of radius R the relative error of the curvature is radius²/(4 R²), from the quartic term.
 
     Args:
         insert: ray caster, insert frame.
@@ -127,17 +127,19 @@ def _fit(
     u, v = u[disc], v[disc]
     places = point + np.stack([u, v], axis=1) @ frame[:2]
     back, normal = inverse(pose), frame[2]
-    over, _ = insert.first(places + radius * normal, -normal)
-    under, _ = femoral.first(transform(back, places - radius * normal), rotate(back, normal))
-    of_insert, of_femoral = radius - over, under - radius
-    # A ray that meets no mesh, or another part of it, is no sample of this patch.
+    insert_distance, _ = insert.first(places + radius * normal, -normal)
+    femoral_distance, _ = femoral.first(
+        transform(back, places - radius * normal), rotate(back, normal)
+    )
+    of_insert, of_femoral = radius - insert_distance, femoral_distance - radius
+    # A ray that misses a mesh, or meets another part of it, is no sample of this patch.
     covered = (np.abs(of_insert) < radius) & (np.abs(of_femoral) < radius)
     if covered.mean() < CURVATURE.least_cover:
         return None
     u, v = u[covered], v[covered]
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
     heights = np.stack([of_insert[covered], of_femoral[covered]], axis=1)
-    # u is some millimetres: columns scaled to equal size keep the least squares well conditioned.
+    # Scaling the columns to equal size keeps the least squares well conditioned.
     scale = radius ** np.array([0, 1, 1, 2, 2, 2])
     coefficients = np.linalg.lstsq(terms / scale, heights, rcond=None)[0] / scale[:, None]
     return coefficients[:, 0], coefficients[:, 1]

@@ -17,7 +17,7 @@ from tkamb.geometry.surface import Surface
 from tkamb.units import DEGREE, MILLIMETRE
 
 TOO_NARROW = "contact is too narrow"
-"""Words of the flag, after "the <side> "."""
+"""Text of the flag after "the <side> "."""
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,9 @@ class NarrowContactSettings:
     """Definition of a contact that is too narrow for the map's points."""
 
     least_inner_points: int = 5
-    """Smallest number of inner points: map points with contact all around. With this number the
-    error of the peak is at most 8 %: a sphere then touches about 17 points, a cylinder three rows
-    of points. Without inner points the peak of a lattice is 5 to 96 % too low (docs/lattice.md)."""
+    """Smallest number of inner points: map points with contact all around. With this number a
+    sphere touches about 17 points, and the error of the peak is at most 8 %. Without inner points
+    the peak of a lattice is 5 to 96 % too low (docs/lattice.md)."""
 
 
 NARROW_CONTACT = NarrowContactSettings()
@@ -39,9 +39,7 @@ def narrow_flags(
     sides: Mapping[str, Mask],
     points: str = "cells",
 ) -> Iterator[str]:
-    """Yield a flag for each condyle with fewer than `NARROW_CONTACT.least_inner_points`.
-
-    An inner point has contact all around, see `surrounded`.
+    """Yield a flag for each condyle with too few inner points (see `surrounded`).
 
     Args:
         triangles: (k, 3) triangles of the contact surface.
@@ -83,7 +81,7 @@ class EdgeSettings:
     """m: spacing of the vertical rays that find the edge. Larger: faster, but the error of the
     distance from the edge is up to half of this spacing."""
     steepest: float = 50.0 * DEGREE
-    """rad: a surface beside the outline with a steeper slope belongs to the rim. Chosen because no
+    """rad: slope above which a surface near the outline belongs to the rim. Chosen because no
     loaded part of a dish is as steep."""
     rim: float = 4.0 * MILLIMETRE
     """m: largest width of the rim. Chosen because a steep surface farther inside is a flank of the
@@ -149,13 +147,13 @@ class ArticularEdge:
         return np.asarray(np.maximum(self.away[tuple(cell.T)] - self.spacing / 2, 0.0), float)
 
 
-def _joined_to_outside(flat: Mask, outside: Mask) -> Mask:
+def _joined_to_outside(mask: Mask, outside: Mask) -> Mask:
     """Return the connected parts of a mask (a, b) that contain a cell outside the insert."""
     from scipy.ndimage import label  # slow import, not needed for a report
 
-    part, _ = label(flat, structure=np.ones((3, 3)))
+    part, _ = label(mask, structure=np.ones((3, 3)))
     touching = np.unique(part[outside])
-    return np.asarray(flat & np.isin(part, touching), bool)
+    return np.asarray(mask & np.isin(part, touching), bool)
 
 
 def edge_of_insert_flags(
@@ -181,10 +179,10 @@ def edge_of_insert_flags(
             continue
         # A pressure below this share of the peak makes no contact at the edge.
         loaded = np.flatnonzero(side_pressure > settings.share * highest)
-        away = edge.distance(points[loaded])
-        if away.min() > settings.reach:
+        distances = edge.distance(points[loaded])
+        if distances.min() > settings.reach:
             continue
-        peak = float(away[np.argmax(side_pressure[loaded])])
+        peak = float(distances[np.argmax(side_pressure[loaded])])
         where = (
             "its peak pressure lies there"
             if peak <= settings.reach

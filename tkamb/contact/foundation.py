@@ -112,8 +112,8 @@ class ElasticFoundation(ContactModel):
         gap = gaps_along_normals(samples, state.pair.femoral, pose)
         strain = np.maximum(-gap, 0.0) / np.maximum(samples.thickness, FOUNDATION.least_thickness)
         if (deep := strain >= DEEPEST).any():
-            whole = (samples.depth >= samples.thickness)[deep].any()
-            return ContactResult.failed(state, pose, TOO_DEEP if whole else OVER_THE_EDGE)
+            full_depth = (samples.depth >= samples.thickness)[deep].any()
+            return ContactResult.failed(state, pose, TOO_DEEP if full_depth else OVER_THE_EDGE)
         pressure = layer_pressure(self.law, state.pair.material, strain)
         medial = medial_points(samples.points, pose, state.pair.split)
         flags = narrow_flags(
@@ -309,8 +309,8 @@ class FoundationProbe:
         samples, (gap, _, face) = self._columns(pose)
         near = gap < WIDEST_EDGE
         samples, gap, femoral = samples.part(near), gap[near], self._state.pair.femoral
-        met = transform(inverse(pose), samples.points + gap[:, None] * samples.normals)
-        normals = rotate(pose, femoral.smooth_normals(met, face[near]))
+        femoral_points = transform(inverse(pose), samples.points + gap[:, None] * samples.normals)
+        normals = rotate(pose, femoral.smooth_normals(femoral_points, face[near]))
         cosine = np.abs(np.einsum("ij,ij->i", normals, samples.normals))
         change = samples.resolution * np.sqrt(np.maximum(1.0 - cosine**2, 0.0)) / cosine
         edge = np.clip(change, FOUNDATION.approach_step, WIDEST_EDGE)

@@ -195,7 +195,10 @@ class Hertz(ContactModel):
                 )
             described = patches[side] = _described(samples, geometry.contact, patch)
             if patch.long_axis > described.thickness:
-                flags.append(f"{SIDES[side]} contact ellipse is wider than the insert is thick")
+                flags.append(
+                    f"the long semi-axis of the {SIDES[side]} contact ellipse exceeds the "
+                    "thickness of the insert: Hertz assumes a half-space"
+                )
         return _collected(state, pose, pressure, patches, tuple(flags))
 
 
@@ -240,8 +243,8 @@ def map_pressure(
         return pressure, 1.0
     beyond = np.abs(offset @ contact.axes.T) - [patch.long_axis, patch.short_axis]
     # Another surface of the insert below or above the contact (post, lip) is not in contact.
-    low = np.abs(offset @ contact.normal) < patch.long_axis + samples.resolution
-    near = np.flatnonzero((beyond.max(axis=1) < 2 * samples.resolution) & low)
+    same_surface = np.abs(offset @ contact.normal) < patch.long_axis + samples.resolution
+    near = np.flatnonzero((beyond.max(axis=1) < 2 * samples.resolution) & same_surface)
     pressure[near] = patch.peak_pressure * _cell_means(samples, near, contact, patch)
     force_on_map = float((pressure * samples.area) @ samples.normals[:, 1])
     return (

@@ -32,8 +32,8 @@ class ContactModel(ABC):
     """Base class of the contact models.
 
     A subclass is a frozen dataclass, and its fields are its options. Every model has `resolution`
-    (m), the spacing of its map points. A `guess` is an earlier result or a `WarmStart`. It changes
-    the computing time, and the result by no more than the tolerance. A model stores nothing between
+    (m), the spacing of its map points. A `guess` is an earlier result or a `WarmStart`. It saves
+    time, and changes the result by no more than the tolerance. A model stores nothing between
     calls. `mobile_bearing` is True if the bottom of a mobile bearing slides. If it is False, the
     model presses a mobile bearing like a fixed one, and presses and runs state this in a note.
     """
@@ -48,8 +48,8 @@ class ContactModel(ABC):
     def prepare(self, pair: ContactPair) -> Any:
         """Return the state of a pair: the work that depends on geometry and material alone.
 
-        Here it is the sampled surface of the insert and the prepared first touch. A model may
-        return any subclass of `tkamb.contact.pair.PreparedContact`.
+        By default this is the sampled surface of the insert and the first touch. A model may return
+        any subclass of `tkamb.contact.pair.PreparedContact`.
         """
         pair.touch_at(np.eye(4))
         return SampledContact(pair, sample_surface(pair.insert, self.resolution))

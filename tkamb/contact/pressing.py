@@ -1,6 +1,6 @@
 """The press of any contact model: the search for the approach along -y that carries a load.
 
-It also checks that the bodies are not pressed through each other.
+`within_insert` checks that the bodies are not pressed through each other.
 """
 
 import math
@@ -144,9 +144,9 @@ def press_by_search(
     search = search_load(reaction or evaluations.reaction, load, start)
     if not math.isfinite(search.approach):
         why = evaluations.at(search.deepest).flags
-        missed = f"a load of {load:g} N cannot be reached"
+        problem = f"a load of {load:g} N cannot be reached"
         return ContactResult.failed(
-            state, pose, missed, *why, iterations=search.evaluations, residual=search.residual
+            state, pose, problem, *why, iterations=search.evaluations, residual=search.residual
         )
     return within_insert(state, _carried(evaluations.at(search.approach), search, load))
 
@@ -154,14 +154,14 @@ def press_by_search(
 def _carried(result: ContactResult, search: LoadSearch, load: float) -> ContactResult:
     """Return the result with status, residual and flags of the search."""
     residual = abs(-float(result.wrench_on_insert[1]) - load) / load
-    # With `not <=` a residual of NaN counts as missed.
-    missed = not residual <= PRESS.coarse_tolerance
+    # With `not <=` a residual of NaN counts as not converged.
+    diverged = not residual <= PRESS.coarse_tolerance
     return replace(
         result,
         iterations=search.evaluations,
         residual=residual,
-        status=ContactStatus.NOT_CONVERGED if missed else result.status,
-        flags=(*result.flags, "the reaction jumps over the load") if missed else result.flags,
+        status=ContactStatus.NOT_CONVERGED if diverged else result.status,
+        flags=(*result.flags, "the reaction jumps over the load") if diverged else result.flags,
     )
 
 
@@ -264,8 +264,8 @@ def unloaded_result(model: Evaluates, state: Any, pose: Array) -> ContactResult:
 def within_insert(state: Any, result: ContactResult, *more: str) -> ContactResult:
     """Return the result after a check that the bodies are not pressed through each other.
 
-    The result is OUT_OF_RANGE if the approach is at least the insert's thickness, and flagged if it
-    is at least `PRESS.flagged_thickness_share` of it. See `compression`.
+    The result is OUT_OF_RANGE if the approach is at least the insert's thickness, and flagged if
+    their ratio is at least `PRESS.flagged_thickness_share`. See `compression`.
 
     Args:
         state: prepared contact.
@@ -311,24 +311,24 @@ def compression(pair: ContactPair, touch: Touch, result: ContactResult) -> tuple
 
 
 def thickness_near(pair: ContactPair, positions: Array) -> Array:
-    """Return the insert's thickness (n,), m, along y at positions (n, 3), from its top down.
+    """Return the insert's thickness (n,), m, along y at positions (n, 3).
 
-    A ray from the top measures it, up to the point where the ray first leaves the insert. Near a
-    rim the thickness is the largest one within `PRESS.rim_distance`. If no ray meets the insert, it
-    is the height of the position above the bottom.
+    A ray from the top measures the thickness to the point where the ray first leaves the insert.
+    Near a rim the thickness is the largest one within `PRESS.rim_distance`. If no ray meets the
+    insert, the result is the height of the position above the bottom.
     """
     low, high = pair.insert.bounds[:, 1]
     columns = (positions[:, None] + COLUMNS).reshape(-1, 3)
     columns[:, 1] = high + PRESS.rim_distance
     enter, _ = pair.insert.rays.first(columns, DOWN)
-    met = np.isfinite(enter)
-    columns[met, 1] -= enter[met] + PRESS.ray_start_depth
+    hits = np.isfinite(enter)
+    columns[hits, 1] -= enter[hits] + PRESS.ray_start_depth
     leave, _ = pair.insert.rays.first(columns, DOWN)
-    met &= np.isfinite(leave)
-    thick = np.where(met, leave + PRESS.ray_start_depth, 0.0).reshape(len(positions), -1)
+    hits &= np.isfinite(leave)
+    thick = np.where(hits, leave + PRESS.ray_start_depth, 0.0).reshape(len(positions), -1)
     # Away from the rim all rays meet the insert, and the middle ray gives the thickness.
-    whole = met.reshape(thick.shape).all(axis=1)
-    thickness = np.where(whole, thick[:, 0], thick.max(axis=1))
+    interior = hits.reshape(thick.shape).all(axis=1)
+    thickness = np.where(interior, thick[:, 0], thick.max(axis=1))
     return np.maximum(
         np.where(thickness > 0, thickness, positions[:, 1] - low), PRESS.ray_start_depth
     )

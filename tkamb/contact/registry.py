@@ -104,7 +104,7 @@ def contact_model(
     for option, value in options.items():
         if option not in known_options:
             raise InputError(f"has no option '{option}'", where, names_near(option, known_options))
-        choices = _words(cls, option)
+        choices = _allowed_values(cls, option)
         if choices and value not in choices:
             advice = f"one of {', '.join(map(str, choices))}"
             raise InputError(f"option '{option}' cannot be {value!r}", where, advice)
@@ -123,7 +123,7 @@ def _options(model: type[ContactModel]) -> list[str]:
     return [option for option in names if option != "resolution"]
 
 
-def _words(model: type[ContactModel], option: str) -> tuple[Any, ...]:
+def _allowed_values(model: type[ContactModel], option: str) -> tuple[Any, ...]:
     """Return the allowed values of an option of type Literal; empty for another type."""
     kind = get_type_hints(model)[option]
     return get_args(kind) if get_origin(kind) is Literal else ()

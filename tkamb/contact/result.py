@@ -24,14 +24,15 @@ from tkamb.units import MEGAPASCAL, MILLIMETRE
 
 @dataclass(frozen=True)
 class ContactResultSettings:
-    """Limits from which a contact result is flagged."""
+    """Limits beyond which a contact result is flagged."""
 
     max_measured_pressure: float = 100.0 * MEGAPASCAL
     """Pa: peak pressure above which a result is flagged. Chosen because measured stress-strain
-    curves of polyethylene end at 40 to 60 MPa."""
+    curves of polyethylene end at 40 to 60 MPa, and the largest von Mises stress of a Hertz contact
+    is about 0.6 of its peak pressure."""
     least_patch_share: float = 0.05
-    """1: smallest share of the force of a patch that may be the contact of a second condyle. Chosen
-    because smaller patches belong to the first condyle."""
+    """1: smallest share of the force on a patch under a second condyle. Chosen because smaller
+    patches belong to the first condyle."""
     least_patch_distance: float = 15.0 * MILLIMETRE
     """m: smallest distance between the centres of two condyles' patches. Chosen because condyles of
     a knee are 40 to 50 mm apart."""
@@ -253,8 +254,8 @@ def medial_points(points: Array, pose: Array, split: float | None) -> Mask:
 def patch_flags(surface: ContactSurface, pressure: Array, nodal_force: Array) -> Iterator[str]:
     """Yield a flag where a component with one condyle presses on two separate patches.
 
-    A patch is a set of loaded points that the map's triangles connect. The condition of the flag is
-    two patches with `CONTACT_RESULT.least_patch_share` of the force each, whose centres are
+    A patch is a set of loaded points that the map's triangles connect. Each of the two patches
+    carries more than `CONTACT_RESULT.least_patch_share` of the force. Their centres are more than
     `CONTACT_RESULT.least_patch_distance` apart.
 
     Args:
@@ -276,10 +277,10 @@ def patch_flags(surface: ContactSurface, pressure: Array, nodal_force: Array) ->
     centres = np.array(
         [np.bincount(patch, weight * x)[large] / force[large] for x in surface.points[loaded].T]
     ).T
-    apart = np.linalg.norm(centres[:, None] - centres, axis=2).max(initial=0.0)
-    if apart > CONTACT_RESULT.least_patch_distance:
+    distance = np.linalg.norm(centres[:, None] - centres, axis=2).max(initial=0.0)
+    if distance > CONTACT_RESULT.least_patch_distance:
         yield (
-            f"contact in separate patches {apart / MILLIMETRE:.0f} mm apart, but the femoral "
+            f"contact in separate patches {distance / MILLIMETRE:.0f} mm apart, but the femoral "
             "component shows one condyle: all of it is called medial; check the meshes' axes"
         )
 
@@ -313,8 +314,8 @@ def _summed(
 def thickness_under(position: Array, points: Array, thickness: Array) -> float:
     """Return the insert's thickness (m) under a position (3,).
 
-    It is interpolated between the four map points that are nearest in x and z, with weights of the
-    inverse distance.
+    The thickness is the mean over the four map points nearest in x and z, weighted with the inverse
+    distance.
     """
     square = (points[:, 0] - position[0]) ** 2 + (points[:, 2] - position[2]) ** 2
     near = np.argpartition(square, 3)[:4] if len(points) > 4 else np.arange(len(points))

@@ -103,7 +103,7 @@ def sample_surface(insert: Surface, resolution: float) -> SurfaceSamples:
     xz, covered, cell = _cells(caster, centres, hit.reshape(shape), resolution)
     points, face, thickness = _through(caster, xz, insert)
     normals = insert.smooth_normals(points, face)
-    # The covered area in the plan view over the cosine of the slope is the area on the surface.
+    # Area on the surface: covered area in the plan view, divided by the cosine of the slope.
     area = covered * resolution**2 / np.maximum(normals[:, 1], MAP_POINT.least_normal_y)
     triangles = _grid_triangles(cell, shape)
     depth = _depth(caster, points, normals, thickness)
@@ -147,9 +147,9 @@ def _gaps(samples: SurfaceSamples, femoral: Surface, back: Array) -> tuple[Array
     steep = np.flatnonzero((gap < 0) & (samples.normals[:, 1] < MAP_POINT.side_start_normal_y))
     if len(steep):
         rim = origins[steep] + below[steep, None] * normals[steep]
-        above, onto = _first_entry(femoral, rim, normals[steep])
+        above, rim_face = _first_entry(femoral, rim, normals[steep])
         free = above > 0
-        gap[steep[free]], face[steep[free]] = above[free], onto[free]
+        gap[steep[free]], face[steep[free]] = above[free], rim_face[free]
     return gap, face
 
 
@@ -172,7 +172,7 @@ def _columns(
 
 
 def _first_entry(femoral: Surface, origins: Array, directions: Array) -> tuple[Array, Index]:
-    """Return the distance (n,), m, to the femur along rays, and the facet; -inf: starts inside."""
+    """Return the distance (n,), m, to the femur along rays, -inf from inside it, and the facet."""
     distance, face = femoral.rays.first(origins, directions)
     _mark_within(distance, face, directions, femoral.face_normals)
     return distance, face
@@ -224,8 +224,8 @@ def _cells(
     )
     count = covered.sum(axis=1)
     mean = np.einsum("ij,ijk->ik", covered, rays) / np.maximum(count, 1)[:, None]
-    away = np.where(covered, np.linalg.norm(rays - mean[:, None], axis=2), np.inf)
-    nearest = rays[np.arange(len(rim)), away.argmin(axis=1)]
+    distance = np.where(covered, np.linalg.norm(rays - mean[:, None], axis=2), np.inf)
+    nearest = rays[np.arange(len(rim)), distance.argmin(axis=1)]
     mean_covered = np.isfinite(_first(caster, mean)[0])[:, None]
     xz, share = centres.copy(), all_hit.ravel().astype(float)
     # The point of a partly covered cell is the centroid of its covered part, or the nearest ray
@@ -309,7 +309,7 @@ def _grid_triangles(cell: Index, shape: tuple[int, int]) -> Index:
 
 
 NEAR = 3e-4
-"""m: a column is evaluated if its gap may be smaller."""
+"""m: gap below which a column is evaluated."""
 OBLIQUE = 2.0
 """1: largest ratio of the change of a gap, along the column, to the femoral displacement."""
 FARTHEST = 3e-3
@@ -346,12 +346,12 @@ class Neighbourhood:
         )
         near = near[:number]
         columns = self._bed.part(near)
-        facing = gaps_and_facets(columns, self._femoral, pose)
+        gaps = gaps_and_facets(columns, self._femoral, pose)
         self._gap[near], self._last_position[near] = (
-            np.minimum(facing[0], FARTHEST),
+            np.minimum(gaps[0], FARTHEST),
             places[:number],
         )
-        return columns, facing
+        return columns, gaps
 
     def _places(self, pose: Array) -> Array:
         return transform(inverse(pose), self._bed.points)

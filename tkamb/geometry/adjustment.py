@@ -50,8 +50,8 @@ class AdjustmentSettings:
     """Condition that restores the recorded rotation. "both": penetration and coronal angle after
     the press both exceed the adjustment (Sharma 2008). "either": one of them does."""
     input_change: float = 0.1 * MILLIMETRE
-    """m: change of a gap at the recorded pose. If it can change the answer by a step, the frame is
-    flagged. Chosen: a fifth of the error of fluoroscopy."""
+    """m: error of a recorded gap. A frame is flagged if this error decides whether the recorded
+    rotation is changed. Chosen: a fifth of the error of fluoroscopy."""
     largest_recorded_gap: float = 3.0 * MILLIMETRE
     """m: if both condyles are farther from the insert, the pose is refused. Chosen because it is
     more than the errors of fluoroscopy."""
@@ -59,8 +59,8 @@ class AdjustmentSettings:
     """m: difference of the condyles' gaps below which the femur is not turned. Chosen because
     meshes do not resolve smaller differences."""
     touch_difference: float = 1e-7
-    """m: difference of the condyles' clearances below which both touch together. Chosen because
-    forces do not change with smaller differences."""
+    """m: difference of the condyles' travel to touch below which both touch together. Chosen
+    because forces do not change with smaller differences."""
     max_turns: int = 20
     """Largest number of steps of the search for the turn at which both condyles touch together.
     Chosen because the search needs fewer."""
@@ -149,10 +149,9 @@ def _limited_turn(
     if abs(largest - limit) <= margin:
         outcome = "turned level" if largest < limit else "left as lift-off"
         flags = (
-            f"coronal angle of {largest / DEGREE:.2f} deg is {outcome}: the limit of "
-            f"{limit / DEGREE:g} deg is so near that {settings.input_change / MILLIMETRE:g} mm at "
-            f"a "
-            "condyle would cross it, and the medial-lateral split jumps there",
+            f"coronal angle of {largest / DEGREE:.2f} deg is {outcome}: an error of "
+            f"{settings.input_change / MILLIMETRE:g} mm at a condyle would cross the limit of "
+            f"{limit / DEGREE:g} deg, where the medial-lateral split jumps",
         )
     return (turn if largest < limit else 0.0), flags
 
@@ -196,8 +195,8 @@ def _coronal_angle(gaps: CondyleGaps) -> tuple[float, float]:
     """Return coronal angle (rad) and intercondylar distance (m); zero and NaN for one condyle."""
     if gaps.lateral is None:
         return 0.0, math.nan
-    apart = gaps.lateral.point_on_femoral - gaps.medial.point_on_femoral
-    distance = math.hypot(apart[1], apart[2])
+    separation = gaps.lateral.point_on_femoral - gaps.medial.point_on_femoral
+    distance = math.hypot(separation[1], separation[2])
     return (gaps.lateral.gap - gaps.medial.gap) / distance, distance
 
 
@@ -215,9 +214,9 @@ def _levelling_turn(
     for _ in range(settings.max_turns):
         if abs(error) < settings.touch_difference or turn == last:
             return last
-        now = difference(turn)
-        slope = (now - error) / (turn - last)
-        last, error = turn, now
+        next_error = difference(turn)
+        slope = (next_error - error) / (turn - last)
+        last, error = turn, next_error
         turn = last - error / (slope if slope != 0.0 else -distance)
     return last
 

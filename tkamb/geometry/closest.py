@@ -122,8 +122,8 @@ class ClosestPointSettings:
     """m: a point that lies higher than this above the bound of the insert's height is outside the
     insert. Chosen because it is above the rounding of a mesh."""
     gap_range: float = 10 * CONDYLE.facet_depth
-    """m: a sample counts if its gap exceeds the smallest gap by less. Chosen because the weight of
-    a farther sample is below 5e-5."""
+    """m: largest excess of a sample's gap over the smallest gap. Chosen because the weight of a
+    farther sample is below 5e-5."""
     rounds: int = 3
     """Number of times that the triangles around the deepest point are divided into four. Larger:
     slower, but a finer position of the point."""
@@ -249,7 +249,7 @@ class ClosestPointQuery:
         """Return the `kept_candidates` deepest vertices inside the insert, deepest first.
 
         A vertex above the bound of the insert's height is outside. The depth along y is an upper
-        bound of the depth, so vertices are evaluated in its order.
+        bound of the depth; vertices are evaluated in the order of this bound.
         """
         near, points = _within_box(condyle.points, pose, *self.insert.bounds)
         under = points[:, 1] < self._ceiling.over(points) + CLOSEST_POINT.clearance

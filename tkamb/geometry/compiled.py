@@ -1,9 +1,9 @@
 """Decorators for loops that numba compiles at the first call and stores on disk.
 
-The import takes 0.1 to 0.4 s. The compiled code is stored beside the module. If that folder cannot
-be written, it is stored in the user's cache (`NUMBA_CACHE_DIR`). Indices are not checked against
-bounds. A compiled function uses no name of another file, because numba's cache does not detect
-changes of other files.
+The import takes 0.1 to 0.4 s. The compiled code is stored beside the module, or in the user's cache
+(`NUMBA_CACHE_DIR`) if that folder cannot be written. Indices are not checked against bounds. A
+compiled function uses no name of another file, because numba's cache does not detect changes of
+other files.
 """
 
 import logging

@@ -55,8 +55,8 @@ class ShellSettings:
 
     least_inner_share: float = 0.33
     """1: smallest share of the surface that faces the middle of the bounding box, the inner surface
-    of a shell. Chosen between 0.41 to 0.44 in nine femoral components and at most 0.24 in inserts;
-    convex bodies have 0."""
+    of a shell. Measured: 0.41 to 0.44 in nine femoral components, at most 0.24 in inserts, 0 in
+    convex bodies."""
     least_opening_share: float = 0.3
     """1: smallest magnitude of the sum of the inner surface's area vectors, as a share of its area.
     A smaller sum shows no opening. Chosen below the 0.38 to 0.52 of nine femoral components; two

@@ -128,7 +128,7 @@ class _Search:
     def _spread(self, start: Index) -> Index | None:
         """Return the middle triangles that follow from a first one; None if they contradict."""
         kind = np.zeros(len(self._faces), np.int8)  # 1: middle triangle, 2: triangle at a tip
-        even = np.zeros(len(self._points), bool)
+        is_tip = np.zeros(len(self._points), bool)
         new, layers = start, []
         while new.size:
             if not self._are_middles(new) or (kind[new] == 2).any():
@@ -139,12 +139,12 @@ class _Search:
                 return None
             kind[self._across[new]] = 2
             tips = np.unique(self.tips(new))
-            tips = tips[~even[tips]]
-            even[tips] = True
+            tips = tips[~is_tip[tips]]
+            is_tip[tips] = True
             new = self._beyond(tips)
             new = new[kind[new] != 1] if (new >= 0).all() else np.array([-1])
-        every = np.concatenate(layers)
-        return None if even[self._faces[every]].any() else every
+        middles = np.concatenate(layers)
+        return None if is_tip[self._faces[middles]].any() else middles
 
     def _are_middles(self, faces: Index) -> bool:
         """Return whether all corners of faces halve the edges between their neighbours' tips."""
@@ -234,7 +234,7 @@ class CurvedSurface:
     def shift(self, faces: Index, weights: Array, direction: Array) -> tuple[Array, Array]:
         """Return the distance from points on triangles to the patches along a direction.
 
-        It is correct to first order in the patch's height.
+        The distance is correct to first order in the patch's height.
 
         Args:
             faces: (n,) triangles, of the finer surface if there is one; -1 for no triangle.

@@ -306,13 +306,13 @@ def _least_clearance(
     best, point = np.inf, np.full(3, np.nan)
     uppers, lowers = len(upper_boxes) // 2, len(lower_boxes) // 2
     upper_size, lower_size = len(upper_corners) // uppers, len(lower_corners) // lowers
-    waiting, least = np.empty((MOST_WAITING, 2), np.int64), np.empty(MOST_WAITING)
+    stack, least = np.empty((MOST_WAITING, 2), np.int64), np.empty(MOST_WAITING)
     box, upper = np.empty(6), np.empty((upper_size, 9))
     polygon, spare = np.empty((MOST_CORNERS, 3)), np.empty((MOST_CORNERS, 3))
-    waiting[0, 0], waiting[0, 1], least[0], size = 1, 1, -np.inf, 1
+    stack[0, 0], stack[0, 1], least[0], size = 1, 1, -np.inf, 1
     while size > 0:
         size -= 1
-        upper_box, lower_box = waiting[size, 0], waiting[size, 1]
+        upper_box, lower_box = stack[size, 0], stack[size, 1]
         if least[size] >= best:
             continue
         if upper_box >= uppers and lower_box >= lowers:
@@ -343,15 +343,17 @@ def _least_clearance(
         _turned_box(upper_boxes[upper_box], rotation, translation, box)
         wide = box[3] - box[0] + box[5] - box[2]
         below_box = lower_boxes[lower_box]
-        halve = upper_box < uppers and (
+        halve_upper = upper_box < uppers and (
             lower_box >= lowers or wide > below_box[3] - below_box[0] + below_box[5] - below_box[2]
         )
         begin = size
         for child in range(2):
             first, second = (
-                (2 * upper_box + child, lower_box) if halve else (upper_box, 2 * lower_box + child)
+                (2 * upper_box + child, lower_box)
+                if halve_upper
+                else (upper_box, 2 * lower_box + child)
             )
-            if halve:
+            if halve_upper:
                 _turned_box(upper_boxes[first], rotation, translation, box)
             bound = _bound(
                 box,
@@ -363,10 +365,10 @@ def _least_clearance(
             )
             if bound >= best:
                 continue
-            waiting[size, 0], waiting[size, 1], least[size] = first, second, bound
+            stack[size, 0], stack[size, 1], least[size] = first, second, bound
             size += 1
         if size == begin + 2 and least[begin] < least[begin + 1]:  # the smaller bound is next
             for k in range(2):
-                waiting[begin, k], waiting[begin + 1, k] = waiting[begin + 1, k], waiting[begin, k]
+                stack[begin, k], stack[begin + 1, k] = stack[begin + 1, k], stack[begin, k]
             least[begin], least[begin + 1] = least[begin + 1], least[begin]
     return best, point

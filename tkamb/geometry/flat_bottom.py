@@ -25,7 +25,7 @@ class FlatBottomSettings:
     Chosen because a smaller flat is a recess."""
     clear_share: float = 0.9
     """1: of two flats that face down, the larger one is the bottom if the smaller one has less than
-    this share of its area. If the areas are closer, the mesh is refused."""
+    this share of the larger one's area. If the areas are closer, the mesh is refused."""
     uneven_noise: float = 1e-6
     """m: noise of the bottom above which a notice is printed. Chosen because a mesh in single
     precision rounds by less."""
@@ -104,8 +104,8 @@ def find_flats(surface: Surface) -> list[FlatBottom]:
 def find_flat_bottom(surface: Surface, rotation: Array | None = None) -> FlatBottom:
     """Return the bottom of an insert: the largest flat that faces -y, within 30 deg.
 
-    Its area must be at least half of that of the largest flat. A notice is printed if it is clearly
-    smaller.
+    Its area must be at least half of the largest flat's area. A notice is printed if its area is
+    clearly smaller.
 
     Args:
         surface: insert in anatomical axes (x anterior, y superior, z right), m.
@@ -277,8 +277,8 @@ def _grown(
             )
             tolerance = min(max(3 * spread, 1e-6), FLAT_BOTTOM.flatness)
             cone = min(max(6 * lean, math.radians(0.5)), _CONE)
-        apart = np.abs(corners @ normal - offset).max(axis=1)
-        chosen = (apart <= tolerance) & (normals[near] @ normal > math.cos(cone))
+        distance = np.abs(corners @ normal - offset).max(axis=1)
+        chosen = (distance <= tolerance) & (normals[near] @ normal > math.cos(cone))
         if chosen.sum() == 0:
             return None
         normal, offset = _plane(corners[chosen], weight[chosen], normal)

@@ -6,7 +6,7 @@ signs are exact, because the areas are computed with integers (`tkamb.geometry.w
 No line therefore passes between two triangles. A line that meets an edge exactly is moved by an
 infinitesimal distance into each of the four quadrants around it (simulation of simplicity,
 Edelsbrunner & Muecke, ACM Trans Graph 9:66 (1990), doi:10.1145/77635.77639). A place that is inside
-for any of the four counts as inside, so that a line along a wall belongs to the body.
+in any of these cases counts as inside, so that a line along a wall belongs to the body.
 
 A place is inside if more entries than exits lie below it (`tkamb.geometry.winding`). A wall between
 two touching bodies therefore does not end an interval, and a void stays empty. A line through a
@@ -95,7 +95,7 @@ def inside_intervals(surface: Surface, axis: int, first: Array, second: Array) -
         odd = np.bincount(lines, minlength=tied.size) % 2 == 1
         if quadrant == 0:
             mended = int(odd.sum())
-            lines, heights = _mend(lines, heights, odd, shape, surface.name)
+            lines, heights = _repaired(lines, heights, odd, shape, surface.name)
         else:
             lines, heights = lines[~odd[lines]], heights[~odd[lines]]
         parts.append((lines[::2], heights[::2], heights[1::2]))
@@ -217,9 +217,9 @@ def _paired(line: Index, height: Array, rising: Mask, count: int) -> tuple[Index
         count: number of lines.
     """
     step = np.where(rising, -1, 1)
-    whole = (np.bincount(line, step, minlength=count) == 0)[line]
-    lines, heights = _distinct(line[~whole], height[~whole], rising[~whole])
-    line, height, step = line[whole], height[whole], step[whole]
+    closed = (np.bincount(line, step, minlength=count) == 0)[line]
+    lines, heights = _distinct(line[~closed], height[~closed], rising[~closed])
+    line, height, step = line[closed], height[closed], step[closed]
     order = np.lexsort((-step, height, line))
     line, height, step = line[order], height[order], step[order]
     winding = np.cumsum(step)
@@ -251,7 +251,7 @@ def _distinct(line: Index, height: Array, rising: Mask) -> tuple[Index, Array]:
     return line[order], height[order]
 
 
-def _mend(
+def _repaired(
     line: Index, height: Array, odd: Mask, shape: tuple[int, int], name: str
 ) -> tuple[Index, Array]:
     """Return the crossings; lines with an odd number of them are repaired from their neighbours."""

@@ -62,8 +62,8 @@ class TriangleTree:
         low, high = corners.min(axis=1), corners.max(axis=1)
         chosen = np.arange(len(corners)) if chosen is None else chosen
         # A triangle without area has no normal, and its edges belong to other triangles, too.
-        real = chosen[surface.areas[chosen] > 0.0]
-        chosen = real if len(real) else chosen
+        with_area = chosen[surface.areas[chosen] > 0.0]
+        chosen = with_area if len(with_area) else chosen
         leaves = chosen[_halved(0.5 * (low + high)[chosen])]
         margin = BOX_TREE.margin * float(np.linalg.norm(np.ptp(surface.bounds, axis=0)))
         count = len(leaves)
@@ -231,7 +231,7 @@ class NearestPoints:
 
         The result of a point that is not finite is the distance inf, triangle -1 and NaN weights.
         """
-        return self._found(points, np.inf)
+        return self._search(points, np.inf)
 
     def within(self, points: Array, reach: float) -> tuple[Index, Nearest]:
         """Return the numbers of the points within `reach` (m) of the surface, and their `Nearest`.
@@ -240,13 +240,13 @@ class NearestPoints:
             points: (n, 3) m, in the surface's frame.
             reach: m, largest distance.
         """
-        nearest = self._found(points, reach)
+        nearest = self._search(points, reach)
         near = np.flatnonzero(nearest.faces >= 0)
         return near, Nearest(
             nearest.distance[near], nearest.faces[near], nearest.weights[near], self
         )
 
-    def _found(self, points: ArrayLike, reach: float) -> Nearest:
+    def _search(self, points: ArrayLike, reach: float) -> Nearest:
         return Nearest(*_nearest_points(*self._tree, rows(points), float(reach)), self)
 
 
@@ -346,8 +346,8 @@ def _nearest_place(
     point: Array,
     reach: float,
     guess: int,
-    waiting: Index,
-    apart: Array,
+    stack: Index,
+    squares: Array,
 ) -> tuple[int, float, float, float]:
     """Return the triangle nearest to a point, and the point on it.
 
@@ -361,8 +361,8 @@ def _nearest_place(
         reach: m, largest distance of the search.
         guess: position in `faces` of a triangle that is probably near, which saves time; -1 for
             none.
-        waiting: (`DEEPEST`,) work array, boxes on the stack.
-        apart: (`DEEPEST`,) work array, squared distances of these boxes (m²).
+        stack: (`DEEPEST`,) work array, boxes on the stack.
+        squares: (`DEEPEST`,) work array, squared distances of these boxes (m²).
 
     Returns:
         Position in `faces`, -1 if none is within reach; squared distance (m²); barycentrics 2 and 3
@@ -375,11 +375,11 @@ def _nearest_place(
         square, s, t = _foot(corners[guess], point)
         if square <= best:
             place, best, second, third = guess, square, s, t
-    waiting[0], apart[0] = 1, 0.0
+    stack[0], squares[0] = 1, 0.0
     while size > 0:
         size -= 1
-        box = waiting[size]
-        if apart[size] > best:
+        box = stack[size]
+        if squares[size] > best:
             continue
         if box >= leaves:
             for row in range((box - leaves) * leaf_size, (box - leaves + 1) * leaf_size):
@@ -393,10 +393,10 @@ def _nearest_place(
         if far < near:
             near_box, far_box, near, far = far_box, near_box, far, near
         if far <= best:
-            waiting[size], apart[size] = far_box, far
+            stack[size], squares[size] = far_box, far
             size += 1
         if near <= best:
-            waiting[size], apart[size] = near_box, near
+            stack[size], squares[size] = near_box, near
             size += 1
     return place, best, second, third
 
@@ -414,13 +414,13 @@ def _nearest_points(
     count = len(points)
     distance, face = np.full(count, np.inf), np.full(count, NO_TRIANGLE)
     weights = np.full((count, 3), np.nan)
-    waiting, apart, guess = np.empty(DEEPEST, np.int64), np.empty(DEEPEST), int(NO_TRIANGLE)
+    stack, squares, guess = np.empty(DEEPEST, np.int64), np.empty(DEEPEST), int(NO_TRIANGLE)
     for n in range(count):
         point = points[n]
         if not np.isfinite(point[0] + point[1] + point[2]):
             continue
         place, square, s, t = _nearest_place(
-            boxes, faces, corners, point, reach, guess, waiting, apart
+            boxes, faces, corners, point, reach, guess, stack, squares
         )
         if place >= 0:
             guess = place  # the next point is often close to this one

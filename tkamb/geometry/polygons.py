@@ -38,7 +38,7 @@ def convex_outline(points: Array, offset: float = 0.0, step_deg: float = 2.0) ->
     """Return the convex hull of points (n, 2), enlarged by `offset`, counter-clockwise.
 
     The corners of the enlarged hull lie on circles about the hull's corners, `step_deg` apart. With
-    2 deg it is too small by at most 0.015 % of the offset.
+    2 deg the hull is too small by at most 0.015 % of the offset.
 
     Raises:
         InputError: the points span no area.
@@ -119,7 +119,7 @@ class PolygonSettings:
     rounding."""
     least_area_share: float = 1e-9
     """1: smallest ratio of a polygon's enclosed area to the total area of its triangles. With a
-    smaller one the polygon crosses itself. Chosen because it is above rounding."""
+    smaller ratio the polygon crosses itself. Chosen because it is above rounding."""
 
 
 POLYGON = PolygonSettings()
@@ -148,8 +148,8 @@ def triangulated(vertices: Array, corners: Index, ends: Index) -> Index:
     polygon, rank = counted(np.maximum(ends - starts - 2, 0))
     first = starts[polygon]
     fans = np.stack([corners[first], corners[first + rank + 1], corners[first + rank + 2]], axis=1)
-    many = np.flatnonzero(ends - starts > 3)
-    if not len(many):
+    larger_polygons = np.flatnonzero(ends - starts > 3)
+    if not len(larger_polygons):
         return fans
     a, b, c = np.moveaxis(vertices[fans], 1, 0)
     cross = np.cross(b - a, c - a)

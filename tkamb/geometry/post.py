@@ -126,14 +126,14 @@ def find_post(insert: Surface) -> Post | None:
             foot = _ground(top, patch, dish) + POST.foot_clearance
             if tip <= foot:  # the surroundings are higher
                 continue
-            high = patch & (top > foot + POST.back_share * (tip - foot))
+            upper_part = patch & (top > foot + POST.back_share * (tip - foot))
             return Post(
                 x=float(x[i].mean()),
                 z=float(z[k].mean()),
                 height=tip - dish,
                 area=len(i) * POST.line_spacing**2,
                 foot=foot,
-                front=float(x[np.nonzero(high)[0]].max()),
+                front=float(x[np.nonzero(upper_part)[0]].max()),
                 half_width=float(np.ptp(z[k]) / 2 + POST.line_spacing / 2),
             )
     return None

@@ -121,12 +121,14 @@ class RayCaster:
                     & (distances >= distances[k] - RAY_GAP.touching_distance)
                     & (np.arange(len(distances)) != k)
                 )
-                later = entries[distances[entries] > distances[0] + RAY_GAP.touching_distance]
-                if not len(later):
+                later_entries = entries[
+                    distances[entries] > distances[0] + RAY_GAP.touching_distance
+                ]
+                if not len(later_entries):
                     break
-                next_in = later[0]
-                touching = distances[next_in] - distances[k] <= RAY_GAP.touching_distance
-                void = shells[k] == shells[next_in] != shells[0]
+                next_entry = later_entries[0]
+                touching = distances[next_entry] - distances[k] <= RAY_GAP.touching_distance
+                void = shells[k] == shells[next_entry] != shells[0]
                 if not (touching or void):
                     break
         return last
@@ -172,10 +174,10 @@ class RayCaster:
             ray (m,), distance (m,), m, and face (m,), sorted by ray, then by distance.
         """
         rays = _rays(origins, directions)
-        number, room = RAY.usual_crossings * len(rays[0]), -1
-        while number > room:
-            room = number
-            ray, distance, face = (np.empty(room, kind) for kind in (np.int64, float, np.int64))
+        number, capacity = RAY.usual_crossings * len(rays[0]), -1
+        while number > capacity:
+            capacity = number
+            ray, distance, face = (np.empty(capacity, kind) for kind in (np.int64, float, np.int64))
             number = _all_crossings(
                 *self._tree, *rays, -self._same, RAY.edge_tolerance, ray, distance, face
             )
@@ -268,7 +270,7 @@ def _first_crossings(
     least: float,
     outside: float,
 ) -> tuple[Array, Index, Array]:
-    """Return the first crossing of each ray; of equally near triangles that with the lowest number.
+    """Return the first crossing of each ray; of equally near triangles the lowest number.
 
     Args:
         boxes: (2 p, 6) m, see `TriangleTree`.
@@ -286,7 +288,7 @@ def _first_crossings(
     leaf_size = len(faces) // leaves
     distance, face = np.full(count, np.inf), np.full(count, NO_TRIANGLE)
     weights = np.full((count, 3), np.nan)
-    waiting, enters = np.empty(DEEPEST, np.int64), np.empty(DEEPEST)
+    stack, enters = np.empty(DEEPEST, np.int64), np.empty(DEEPEST)
     direction, slowness = np.empty(3), np.empty(3)
     for n in range(count):
         origin = origins[n]
@@ -295,10 +297,10 @@ def _first_crossings(
         if not np.isfinite(origin[0] + origin[1] + origin[2]):
             continue
         best, best_face, size = np.inf, NO_TRIANGLE, 1
-        waiting[0], enters[0] = 1, _entry(boxes[1], origin, slowness)
+        stack[0], enters[0] = 1, _entry(boxes[1], origin, slowness)
         while size > 0:
             size -= 1
-            box = waiting[size]
+            box = stack[size]
             if enters[size] > best or enters[size] == np.inf:
                 continue
             if box >= leaves:
@@ -318,10 +320,10 @@ def _first_crossings(
             if far < near:
                 near_box, far_box, near, far = far_box, near_box, far, near
             if far < np.inf and far <= best:
-                waiting[size], enters[size] = far_box, far
+                stack[size], enters[size] = far_box, far
                 size += 1
             if near < np.inf and near <= best:
-                waiting[size], enters[size] = near_box, near
+                stack[size], enters[size] = near_box, near
                 size += 1
         distance[n], face[n] = best, best_face
     return distance, face, weights
@@ -351,21 +353,21 @@ def _all_crossings(
     """
     leaves, number = len(boxes) // 2, 0
     leaf_size = len(faces) // leaves
-    waiting, direction, slowness = np.empty(DEEPEST, np.int64), np.empty(3), np.empty(3)
+    stack, direction, slowness = np.empty(DEEPEST, np.int64), np.empty(3), np.empty(3)
     for n in range(len(origins)):
         origin = origins[n]
         if n < len(directions):
             _set_direction(directions[n], direction, slowness)
         if not np.isfinite(origin[0] + origin[1] + origin[2]):
             continue
-        waiting[0], size = 1, 1
+        stack[0], size = 1, 1
         while size > 0:
             size -= 1
-            box = waiting[size]
+            box = stack[size]
             if _entry(boxes[box], origin, slowness) == np.inf:
                 continue
             if box < leaves:
-                waiting[size], waiting[size + 1] = 2 * box, 2 * box + 1
+                stack[size], stack[size + 1] = 2 * box, 2 * box + 1
                 size += 2
                 continue
             for place in range((box - leaves) * leaf_size, (box - leaves + 1) * leaf_size):

@@ -117,9 +117,9 @@ def repair(vertices: Array, faces: Index) -> Repair:
     return Repair(vertices, faces, messages, holes, _forks(faces), one_sided)
 
 
-def _notice(count: int, noun: str, what: str) -> str:
+def _notice(count: int, noun: str, action: str) -> str:
     several = noun.replace("vertex", "vertice") + "s"
-    return f"{count} {noun if count == 1 else several} {what}" if count else ""
+    return f"{count} {noun if count == 1 else several} {action}" if count else ""
 
 
 def _merged(vertices: Array, faces: Index) -> tuple[Array, Index]:
@@ -383,8 +383,10 @@ def touching_groups(vertices: Array, bodies: list[Index], faces: Index, wall: In
         part = np.intersect1d(body, wall)
         if not len(part):
             continue
-        whole = Surface(vertices, faces[part], merged=True)
-        points = whole.triangles.mean(axis=1) + INNER_WALL.probe_distance * whole.face_normals
+        wall_part = Surface(vertices, faces[part], merged=True)
+        points = (
+            wall_part.triangles.mean(axis=1) + INNER_WALL.probe_distance * wall_part.face_normals
+        )
         for b in range(len(bodies)):
             if group[a] != group[b] and skins[b].winding.inside(points).any():
                 group = [group[a] if each == group[b] else each for each in group]

@@ -143,7 +143,7 @@ class Surface:
     def corner_normals(self) -> Array:
         """Unit normals (k, 3, 3) at the corners, weighted by angle; edges over 40 deg stay sharp.
 
-        Their error is at most a tenth of the error of facet normals.
+        The error of these normals is at most a tenth of the error of facet normals.
         """
         return corner_normals(self, SHARP_EDGE, corner_angles(self))
 

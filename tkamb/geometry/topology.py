@@ -184,7 +184,7 @@ class Body:
 
 
 def separate_bodies(vertices: Array, faces: Index) -> list[Body]:
-    """Return the bodies of a surface, that with the largest outer surface first.
+    """Return the bodies of a surface, sorted by the area of the outer surface, largest first.
 
     The normals of a void point into the void, so its volume is negative. A closed part is a void of
     another closed part if its volume is negative and its bounding box lies within the other part's.

@@ -94,7 +94,7 @@ def _frames_of(folder: Path) -> tuple[str, str]:
 def _rows_of(folder: Path) -> tuple[str, str]:
     """Return the command of a folder's unfinished study ("" without one), and the study's file."""
     name = "rows.jsonl"
-    if any((folder / done).is_file() for done in ("tradeoff.json", "stability.json")):
+    if any((folder / summary).is_file() for summary in ("tradeoff.json", "stability.json")):
         return "", name
     try:
         first = read_text(folder / name, FILE_LIMITS.table_bytes).partition("\n")[0]
@@ -123,7 +123,7 @@ def claimed_directory(path: str | Path, force: bool = False, command: str = "") 
 
     Args:
         path: the folder; it is made if it does not exist.
-        force: whether the folder may hold foreign files, which do not change, or another command's
+        force: whether the folder may hold foreign files, which stay unchanged, or another command's
             output.
         command: tkamb command that writes into the folder; "": any command's output is allowed.
 
@@ -169,7 +169,7 @@ def claimed_directory(path: str | Path, force: bool = False, command: str = "") 
 
 
 def settle(folder: Path) -> None:
-    """Complete a killed process's file changes in a folder. Call it before reading the folder.
+    """Complete a killed process's file changes in a folder, which may then be read.
 
     Raises:
         InputError: the changes cannot be completed.
@@ -290,8 +290,8 @@ OWN_MARK = b"tkamb"
 MARK_WITHIN = 4096
 """Number of bytes at the beginning of a file that are searched for the mark."""
 PICTURES = {".png": (0, b"\x89PNG"), ".gif": (0, b"GIF8"), ".mp4": (4, b"ftyp")}
-"""Suffix of a picture or film -> offset and bytes that its format has there. These files have no
-mark of tkamb, so that one may replace any other of its format."""
+"""Suffix of a picture or film -> (offset, bytes) that identify its format. Pictures and films have
+no mark of tkamb. One may therefore replace any other of its format."""
 
 
 def check_output_file(path: str | Path | None, force: bool = False) -> None:
@@ -326,14 +326,14 @@ def check_output_file(path: str | Path | None, force: bool = False) -> None:
 def _object(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file, or {} if the file is unreadable or holds no object."""
     try:
-        claim = read_json(path)
+        content = read_json(path)
     except InputError:
         return {}
-    return claim if isinstance(claim, dict) else {}
+    return content if isinstance(content, dict) else {}
 
 
 def _exists(path: Path) -> bool:
     try:
         return path.exists()
-    except (OSError, ValueError):  # The name is too long or has a NUL; `mkdir` reports this later.
+    except (OSError, ValueError):  # `mkdir` later reports a name that is too long or has a NUL.
         return True

@@ -42,8 +42,8 @@ def given_material(table: Mapping[str, Any], where: object = "[material]") -> Ma
 
     A table with only `base` is that built-in material. Further keys replace the base's values.
     Without `base`, the table needs Young's modulus, Poisson's ratio and the numbers of its law.
-    Young's modulus of a tabulated curve is its slope at the origin. If it is given too, the curve
-    is scaled to it.
+    Young's modulus of a tabulated curve is its slope at the origin. If the table also gives
+    `young_modulus_MPa`, the curve is scaled to that value.
 
     Args:
         table: keys of docs/materials.md; a key with value None is ignored.
@@ -160,8 +160,8 @@ def material_in_words(values: Mapping[str, Any]) -> str:
 def _check_name(entries: Mapping[str, Any], where: object) -> None:
     name = entries.get("name")
     if name in MATERIALS:
-        what = f"name '{name}' is that of a built-in material"
-        raise InputError(what, where, "choose another, so that results show which one was used")
+        what = f"'{name}' is the name of a built-in material"
+        raise InputError(what, where, "choose another name, so that results show the material")
 
 
 def _law(entries: Mapping[str, Any], base: Material | None, where: object) -> StressStrainLaw:
@@ -169,16 +169,16 @@ def _law(entries: Mapping[str, Any], base: Material | None, where: object) -> St
     name = entries.get("law")
     if name is not None and name not in LAW_KEYS:
         raise InputError(f"no law '{name}'", where, names_near(str(name), LAW_KEYS))
-    own = base.law if base is not None else None
-    if name is None and isinstance(own, RambergOsgood):
+    base_law = base.law if base is not None else None
+    if name is None and isinstance(base_law, RambergOsgood):
         name = "ramberg-osgood"
     name = name or "linear"
     values = {key: entries[key] for keys in LAW_KEYS.values() for key in keys if key in entries}
-    if name == "ramberg-osgood" and isinstance(own, RambergOsgood):
+    if name == "ramberg-osgood" and isinstance(base_law, RambergOsgood):
         values = {
-            "alpha": own.alpha,
-            "reference_stress_MPa": own.reference_stress / MEGAPASCAL,
-            "exponent": own.exponent,
+            "alpha": base_law.alpha,
+            "reference_stress_MPa": base_law.reference_stress / MEGAPASCAL,
+            "exponent": base_law.exponent,
         } | values
     for key in values:
         if key not in LAW_KEYS[name]:

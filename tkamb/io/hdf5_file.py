@@ -2,7 +2,7 @@
 
 The HDF5 library cannot close a file after a failed write: it tries again, fails, and ends the
 process. tkamb lets the library write through a Python file object. This object records the first
-failure and ignores later writes, so that the library can close the file. Then `new_hdf5` raises.
+failure and ignores later writes. The library can then close the file, and `new_hdf5` raises.
 """
 
 import os
@@ -63,10 +63,10 @@ class NotingFile:
     def write(self, content: Any) -> int:
         """Write all bytes; after a failure, only move the position."""
         view = memoryview(content).cast("B")
-        done = 0
-        while done < len(view) and self.failure is None:
+        written = 0
+        while written < len(view) and self.failure is None:
             try:
-                done += os.pwrite(self._descriptor, view[done:], self._place + done)
+                written += os.pwrite(self._descriptor, view[written:], self._place + written)
             except OSError as error:
                 self.failure = error
         self._place += len(view)

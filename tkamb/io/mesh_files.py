@@ -40,8 +40,8 @@ class LatticeReport:
 
     def lines(self) -> list[str]:
         """Return the report as lines of text."""
-        left = "; the left insert's mirror image" if self.side == "left" else ""
-        written = [] if self.out is None else [f"written to {self.out}{left}"]
+        mirrored = "; the left insert's mirror image" if self.side == "left" else ""
+        written = [] if self.out is None else [f"written to {self.out}{mirrored}"]
         return [*self.quality.lines(), *written]
 
     def as_dict(self) -> dict[str, Any]:
@@ -114,7 +114,8 @@ def write_body(path: str | Path, number: int, out: str | Path) -> str:
     """
     out = Path(out)
     if out.suffix.lower() not in BODY_FORMATS:
-        raise InputError(f"is none of {', '.join(BODY_FORMATS)}", out, "name a file that ends so")
+        hint = f"choose a name that ends in {' or '.join(BODY_FORMATS)}"
+        raise InputError("has no format for meshes", out, hint)
     if os.path.exists(out):
         raise InputError(
             "exists already", out, "give a new file: tkamb does not replace your files"

@@ -192,7 +192,8 @@ def _put(content: dict[str, Any], dotted: str, value: Any) -> None:
 class Sharma2008(Preset):
     """Sharma, dissertation, University of Tennessee, Knoxville (2008), chapter 4.
 
-    It sets each choice that a key of the scene can express. Comments name the section of the study.
+    The preset sets each choice that a key of the scene can express. Comments name the section of
+    the study.
     """
 
     name: ClassVar[str] = "sharma-2008"
@@ -227,13 +228,13 @@ class Sharma2008(Preset):
     )
     needs: ClassVar[Mapping[str, str]] = MappingProxyType(
         {
-            "implant.femoral": "it presses the femoral component into the insert",
-            "implant.insert": "the lattice is made from its mesh",
+            "implant.femoral": "the study presses the femoral component into the insert",
+            "implant.insert": "the lattice is made from the insert's mesh",
             "tibia": "the shank turns about the ankle in the sagittal plane",
             "ground_reaction": "the force plate's force acts at the ankle",
             "quadriceps": "its tension is solved from the equations of motion",
             "patellar_ligament": "its tension is solved from the equations of motion",
-            "patella": "quadriceps and patellar ligament meet there",
+            "patella": "quadriceps and patellar ligament meet at the patella",
         }
     )
 
@@ -252,7 +253,7 @@ class Sharma2008(Preset):
         kind = content["tibia"].get("kind")
         if kind != "sagittal":
             result.append(f"the shank moves as recorded ([tibia] kind = '{kind}'), in 3D")
-        laws = {one.get("law") for one in content.get("ligament", ())} - {"two-line"}
+        laws = {table.get("law") for table in content.get("ligament", ())} - {"two-line"}
         if laws:
             result.append(f"ligaments follow the law {', '.join(sorted(map(repr, laws)))}")
         if content.get("generic_ligaments"):

@@ -90,12 +90,12 @@ def write_map_series(maps: "ContactMaps", folder: Path) -> list[str]:
     Raises:
         InputError: no frame has a map, or the folder cannot be written.
     """
-    whole = np.flatnonzero(np.isfinite(maps.pressure_Pa).all(axis=1))
-    if not len(whole):
+    mapped_frames = np.flatnonzero(np.isfinite(maps.pressure_Pa).all(axis=1))
+    if not len(mapped_frames):
         raise InputError("no frame has a pressure map", "export --vtp")
     root = Element("VTKFile", type="Collection", version="1.0", byte_order="LittleEndian")
     collection, names = SubElement(root, "Collection"), []
-    for k in map(int, whole):
+    for k in map(int, mapped_frames):
         names.append(f"contact_{k:04d}.vtp")
         write_triangles(folder / names[-1], maps.points_m, maps.triangles, maps.frame_data(k))
         SubElement(collection, "DataSet", timestep=repr(float(maps.time_s[k])), file=names[-1])

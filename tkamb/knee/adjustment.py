@@ -3,22 +3,21 @@
 The medial-lateral split depends on a rotation that is smaller than the error of fluoroscopy. The
 recorded femur is therefore adjusted until both condyles touch. After the press the adjustment is
 compared with the penetration. Sharma (2008), section 4.3, figure 4-8: "If the final femoral
-penetration and coronal
-angle is more than the adjustments made, the original orientation of the femur is restored and the
-analysis is reconducted." The rule has two readings, `AdjustmentSettings.restore_when`:
+penetration and coronal angle is more than the adjustments made, the original orientation of the
+femur is restored and the analysis is reconducted." `AdjustmentSettings.restore_when` selects one of
+two readings of this rule:
 
 - "both" (Sharma's wording, and the default): the orientation is restored if the penetration
   exceeds the translation and the coronal angle of the penetrations exceeds the rotation.
-- "either": the orientation is restored if one of the two exceeds its adjustment. Penetration then
-  decides almost alone. The translation of a femur recorded at the right height is small, so nearly
-  every load restores it. The split jumps if the recorded height changes by a tenth of a millimetre.
+- "either": the orientation is restored if one of the two exceeds its adjustment. The translation of
+  a femur recorded at the right height is small, so nearly every load restores the orientation. The
+  split then jumps if the recorded height changes by a tenth of a millimetre.
 
 The result has a flag if a change of the recorded pose by `AdjustmentSettings.input_change` may
-change that decision.
+change the decision to restore the orientation.
 
 The adjustment should leave the total force unchanged (Sharma 2008, 5.2.2: less than 0.001 BW).
-`adjustment_effect` compares the loads with those of the recorded contact points. A run flags a
-frame if the total force differs.
+`adjustment_effect` compares the loads with and without adjustment.
 """
 
 from collections.abc import Mapping
@@ -46,9 +45,8 @@ class SplitSensitivitySettings:
     """The finite difference of the medial force with respect to adduction."""
 
     adduction_step: float = 0.02 * DEGREE
-    """rad: step of the finite difference. Chosen because 0.2 to 0.5 deg unload a condyle, and this
-    step shifts about 60 N, thirty times the lattice's tolerance. Results with steps of 0.005 to
-    0.1 deg agree within 5 to 15 %."""
+    """rad: step of the finite difference. Chosen because it shifts about 60 N between the condyles,
+    thirty times the lattice's tolerance, and 0.2 deg or more unload a condyle."""
 
 
 SPLIT_SENSITIVITY = SplitSensitivitySettings()
@@ -69,21 +67,21 @@ def split_sensitivity(
 
     Args:
         probe: probe of the contact model.
-        result: a contact; its load is the force along -y.
+        result: the contact before the change of adduction; its load is the force along -y.
         start: warm start that was returned with this contact; None: made from the contact.
     """
     load = -float(result.wrench_on_insert[1])
-    place = knee_coordinates(result.pose)
-    place[ADDUCTION] += SPLIT_SENSITIVITY.adduction_step
-    begin = WarmStart.after(result) if start is None else start
-    rotated, _ = probe.pressed(load, knee_pose(place), begin)
+    coordinates = knee_coordinates(result.pose)
+    coordinates[ADDUCTION] += SPLIT_SENSITIVITY.adduction_step
+    warm_start = WarmStart.after(result) if start is None else start
+    rotated, _ = probe.pressed(load, knee_pose(coordinates), warm_start)
     if rotated.status is not ContactStatus.OK:
         return float("nan")
     return (_medial(rotated) - _medial(result)) / SPLIT_SENSITIVITY.adduction_step
 
 
 def split_tangent(probe: "Probe", result: ContactResult) -> float:
-    """Return the same quantity as `split_sensitivity` from the exact tangent, N/rad.
+    """Return the quantity of `split_sensitivity` from the contact's exact tangent, N/rad.
 
     Let t be the tangent of a condyle's force on the insert, and n the medial contact normal. At a
     constant superior-inferior load an adduction da lowers or lifts the femur by
@@ -91,22 +89,22 @@ def split_tangent(probe: "Probe", result: ContactResult) -> float:
 
     Args:
         probe: probe of a contact model whose tangent is exact.
-        result: a contact.
+        result: the contact at which the tangent is evaluated.
     """
-    place = knee_coordinates(result.pose)
+    coordinates = knee_coordinates(result.pose)
     condyles = probe.seen(result).condyles
     if len(condyles) < 2:
         return 0.0
-    twists = knee_axes(place)[[ADDUCTION, SUPERIOR]].T
+    twists = knee_axes(coordinates)[[ADDUCTION, SUPERIOR]].T
     changes = {
         side: condyle.stiffness[:3] @ twists
         for side, condyle in condyles.items()
         if condyle.stiffness is not None
     }
     total = sum(change[1] for change in changes.values())
-    # A unit adduction, and the change of height that keeps the load constant.
-    follow = np.array([1.0, -total[0] / total[1]])
-    return float(-condyles["medial"].normal @ changes["medial"] @ follow)
+    # Unit adduction with the change of height that keeps the load constant.
+    displacement = np.array([1.0, -total[0] / total[1]])
+    return float(-condyles["medial"].normal @ changes["medial"] @ displacement)
 
 
 def _medial(result: ContactResult) -> float:
@@ -115,11 +113,11 @@ def _medial(result: ContactResult) -> float:
 
 @dataclass(frozen=True)
 class AdjustmentEffectSettings:
-    """How the effect of an adjustment is described."""
+    """Limit for the words that describe the effect of an adjustment."""
 
     jump_distance: float = 5.0 * MILLIMETRE
-    """m: a contact point that moves farther than this has jumped to or from the eminence or lip.
-    Chosen because a contact point on one dish moves by less from frame to frame."""
+    """m: displacement of a contact point above which the text says "jumps" and not "moves". Chosen
+    because a contact point on one dish moves by less from frame to frame."""
 
 
 ADJUSTMENT_EFFECT = AdjustmentEffectSettings()
@@ -127,11 +125,11 @@ ADJUSTMENT_EFFECT = AdjustmentEffectSettings()
 
 @dataclass(frozen=True)
 class AdjustmentEffect:
-    """Difference of the adjusted frame from the recorded frame.
+    """Difference of a frame with adjustment from the same frame without.
 
     Args:
-        force: change of the total contact force, N; NaN if one of the two has no solution.
-        share: change of medial / (medial + lateral) normal force.
+        force: change of the total contact force, N; NaN if one of the two frames has no solution.
+        share: change of the medial share of the normal force.
         cause: words that describe the largest change of the contact.
     """
 
@@ -154,7 +152,9 @@ def adjustment_effect(
         points_adjusted: side -> contact point of the adjusted pose.
         points_recorded: side -> contact point of the recorded pose.
     """
-    total, before = (float(np.linalg.norm(one.contact_force)) for one in (adjusted, recorded))
+    total, total_recorded = (
+        float(np.linalg.norm(one.contact_force)) for one in (adjusted, recorded)
+    )
     share = _share(adjusted, points_adjusted) - _share(recorded, points_recorded)
     with_adjustment, without = (
         _name_carriers(loads, points)
@@ -164,7 +164,7 @@ def adjustment_effect(
         cause = f"with it {with_adjustment}, without it {without}"
     else:
         cause = _largest_move(points_adjusted, points_recorded)
-    return AdjustmentEffect(total - before, share, cause)
+    return AdjustmentEffect(total - total_recorded, share, cause)
 
 
 def _share(loads: SolvedLoads, points: Mapping[str, CondylePoint]) -> float:
@@ -178,12 +178,17 @@ def _name_carriers(loads: SolvedLoads, points: Mapping[str, CondylePoint]) -> st
     return "both condyles carry" if len(sides) > 1 else f"the {sides[0]} condyle alone carries"
 
 
-def _largest_move(now: Mapping[str, CondylePoint], before: Mapping[str, CondylePoint]) -> str:
+def _largest_move(
+    adjusted: Mapping[str, CondylePoint], recorded: Mapping[str, CondylePoint]
+) -> str:
     """Return a phrase that names the contact point with the largest displacement."""
-    distances = {side: float(np.linalg.norm(now[side].point - before[side].point)) for side in now}
+    distances = {
+        side: float(np.linalg.norm(adjusted[side].point - recorded[side].point))
+        for side in adjusted
+    }
     side = max(distances, key=lambda name: distances[name])
-    word = "jumps" if distances[side] > ADJUSTMENT_EFFECT.jump_distance else "moves"
-    return f"the {side} contact point {word} by {distances[side] / MILLIMETRE:.1f} mm"
+    verb = "jumps" if distances[side] > ADJUSTMENT_EFFECT.jump_distance else "moves"
+    return f"the {side} contact point {verb} by {distances[side] / MILLIMETRE:.1f} mm"
 
 
 def press_adjusted(
@@ -202,7 +207,7 @@ def press_adjusted(
         load: superior-inferior force, N.
         adjustment: adjustment of the recorded pose, from `tkamb.geometry.adjustment.adjust`.
         query: closest points of the same pair of bodies.
-        start: an earlier result or a warm start; it saves time.
+        start: an earlier result or a warm start, to save time.
 
     Returns:
         The contact with the flags of the adjustment added, the checked adjustment, and the warm
@@ -216,12 +221,12 @@ def press_adjusted(
     if result.status is not ContactStatus.OK or final:
         adjustment = replace(adjustment, penetration=float(result.approach))
         return _flagged(result, adjustment), adjustment, start
-    checked, restore, doubts = _check(query, adjustment, result)
+    checked, restore, decision_flags = _check(query, adjustment, result)
     if restore:
         pose, translation, flags = moved_to_touch(query, checked.recorded, checked.settings)
         checked = replace(checked, pose=pose, translation=translation, restored=True, flags=flags)
         result, start = model.press_from(state, load, pose, start)
-    checked = replace(checked, flags=(*checked.flags, *doubts))
+    checked = replace(checked, flags=(*checked.flags, *decision_flags))
     return _flagged(result, checked), checked, start
 
 
@@ -250,16 +255,16 @@ def _check(
             _either_side(deeper, margin), _either_side(angle_excess, margin * tilted)
         )
     }
-    doubts: tuple[str, ...] = ()
+    decision_flags: tuple[str, ...] = ()
     if len(outcomes) > 1:
-        doubts = (
+        decision_flags = (
             f"femoral adjustment: a change of the recorded pose by {margin / MILLIMETRE:g} mm "
             f"decides "
-            "whether the recorded rotation is restored; the medial-lateral split depends on it",
+            "whether the recorded rotation is restored; this changes the medial-lateral split",
         )
     restore = _restored(settings.restore_when, deeper > 0, angle_excess > 0)
     checked = replace(adjustment, penetration=penetration, final_angle=angle)
-    return checked, restore, doubts
+    return checked, restore, decision_flags
 
 
 def _either_side(excess: float, margin: float) -> set[bool]:

@@ -2,8 +2,8 @@
 
 The knee divides the tree of a model in two. The shank is every body on the tibia's side of the
 knee, including the foot. The thigh is the body to which the frame "femur" is fixed. The pelvis acts
-on the thigh by the load at the hip. So the same equations hold for a leg that stands on its foot,
-a leg that hangs from a pelvis, and a whole body.
+on the thigh by the load at the hip. The same equations therefore hold for a leg that stands on its
+foot, a leg that hangs from a pelvis, and a whole body.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ INSERT_JOINT, PLANE_JOINT = "knee_ap", "patella_ap"
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class FixedFrame:
     """A frame that is fixed to a joint of the model.
 
     Args:
@@ -48,19 +48,19 @@ class Anatomy:
         hip: hip centre, fixed to the femur.
         patella: frame of a patella that moves against the femur; None: the model has none.
         plane: frame of the patella's sagittal plane, fixed to the femur.
-        knee_joints: indices of the joints between tibia and femur, from the root outwards.
+        knee_joints: indices of the joints between tibia and femur, ascending.
         shank: indices of the joints whose bodies are on the tibia's side.
         names: part -> name of its frame, as given by the user.
     """
 
     model: pin.Model
-    tibia: Place
-    femur: Place
-    femoral: Place
-    insert: Place
-    hip: Place
-    patella: Place | None
-    plane: Place
+    tibia: FixedFrame
+    femur: FixedFrame
+    femoral: FixedFrame
+    insert: FixedFrame
+    hip: FixedFrame
+    patella: FixedFrame | None
+    plane: FixedFrame
     knee_joints: tuple[int, ...]
     shank: tuple[int, ...]
     names: Mapping[str, str]
@@ -70,11 +70,11 @@ class Anatomy:
         """Whether the tibia is fixed to the universe."""
         return self.tibia.joint == 0
 
-    def frame(self, name: str) -> Place:
+    def frame(self, name: str) -> FixedFrame:
         """Return the frame of a part of the knee, or of a name in the model.
 
         Raises:
-            InputError: no such frame.
+            InputError: the frame does not exist.
         """
         names = {
             "femur": self.femur,
@@ -111,11 +111,11 @@ def find_anatomy(
     for part in names:
         if part not in PARTS:
             raise InputError(f"no part '{part}' of the knee", "frames", names_near(part, PARTS))
-    places = {}
+    frames = {}
     for part in PARTS:
         if part in names or part in NEEDED or model.existFrame(part):
-            places[part] = _frame(model, names.get(part, part), part)
-    tibia, femur = places["tibia"], places["femur"]
+            frames[part] = _frame(model, names.get(part, part), part)
+    tibia, femur = frames["tibia"], frames["femur"]
     path = _path(model, tibia.joint, femur.joint)
     if not path:
         raise InputError(
@@ -128,29 +128,29 @@ def find_anatomy(
             "one must carry the other",
         )
     _check_joints(model, joints, path)
-    patella = places.get("patella")
+    patella = frames.get("patella")
     if patella is not None and patella.joint == femur.joint:
         patella = None
     shank = _shank(model, tibia.joint, femur.joint, path, patella)
     for part, base in (("insert", tibia), ("femoral", femur), ("hip", femur)):
-        if part in places and places[part].joint != base.joint:
+        if part in frames and frames[part].joint != base.joint:
             raise InputError(
                 f"is not fixed to the {'tibia' if base is tibia else 'femur'}",
                 f"frame {names.get(part, part)}",
-                f"name another one: frames={{'{part}': ...}}",
+                f"name another frame: frames={{'{part}': ...}}",
             )
-    insert = places.get("insert") or _joint_placement(model, INSERT_JOINT, tibia) or tibia
+    insert = frames.get("insert") or _joint_placement(model, INSERT_JOINT, tibia) or tibia
     if plane is not None:
-        sagittal = Place(femur.joint, femur.placement * plane)
+        sagittal = FixedFrame(femur.joint, femur.placement * plane)
     else:
         sagittal = _joint_placement(model, PLANE_JOINT, femur) or femur
     return Anatomy(
         model,
         tibia,
         femur,
-        places.get("femoral") or femur,
+        frames.get("femoral") or femur,
         insert,
-        places.get("hip") or _hip(femur, path),
+        frames.get("hip") or _hip(femur, path),
         patella,
         sagittal,
         path,
@@ -159,36 +159,36 @@ def find_anatomy(
     )
 
 
-def _frame(model: pin.Model, name: str, part: str | None = None) -> Place:
-    """Return the frame with a name. A body's frame takes precedence over others of that name."""
+def _frame(model: pin.Model, name: str, part: str | None = None) -> FixedFrame:
+    """Return the frame with a name; of several frames with this name, the frame of a body."""
     if not model.existFrame(name):
         names = [frame.name for frame in model.frames]
         hint = names_near(name, names)
         if part is not None:
             hint = f"name it: frames={{'{part}': ...}}; {hint}"
         raise InputError(f"no frame '{name}' in the model", "frames", hint)
-    same = [frame for frame in model.frames if frame.name == name]
-    bodies = [frame for frame in same if frame.type == pin.FrameType.BODY]
-    frame = (bodies or same)[0]
-    return Place(frame.parentJoint, frame.placement)
+    candidates = [frame for frame in model.frames if frame.name == name]
+    bodies = [frame for frame in candidates if frame.type == pin.FrameType.BODY]
+    frame = (bodies or candidates)[0]
+    return FixedFrame(frame.parentJoint, frame.placement)
 
 
-def _joint_placement(model: pin.Model, name: str, base: Place) -> Place | None:
+def _joint_placement(model: pin.Model, name: str, base: FixedFrame) -> FixedFrame | None:
     """Return the placement of a joint on the body of a frame; None if it is on another body."""
     if not model.existJointName(name):
         return None
     joint = model.getJointId(name)
     if model.parents[joint] != base.joint:
         return None
-    return Place(base.joint, model.jointPlacements[joint])
+    return FixedFrame(base.joint, model.jointPlacements[joint])
 
 
 def _ancestors(model: pin.Model, joint: int) -> list[int]:
     """Return a joint and its parents, up to the universe."""
-    line = [joint]
-    while line[-1]:
-        line.append(int(model.parents[line[-1]]))
-    return line
+    joints = [joint]
+    while joints[-1]:
+        joints.append(int(model.parents[joints[-1]]))
+    return joints
 
 
 def _path(model: pin.Model, one: int, other: int) -> tuple[int, ...]:
@@ -209,29 +209,30 @@ def _check_joints(model: pin.Model, joints: Sequence[str], path: tuple[int, ...]
 
 
 def _shank(
-    model: pin.Model, tibia: int, femur: int, path: tuple[int, ...], patella: Place | None
+    model: pin.Model, tibia: int, femur: int, path: tuple[int, ...], patella: FixedFrame | None
 ) -> tuple[int, ...]:
     """Return the joints of all bodies that remain connected to the tibia if the knee is cut.
 
     A body between femur and tibia belongs to the shank. Bodies attached to the femur, the patella
     or the universe do not.
     """
-    side = {tibia, *path} - {femur}
-    apart = {0, femur} | (set() if patella is None else {patella.joint})
+    shank = {tibia, *path} - {femur}
+    excluded = {0, femur} | (set() if patella is None else {patella.joint})
+    # Parents and children join the shank until no body is added.
     grows = True
     while grows:
-        before = len(side)
-        side |= {int(model.parents[joint]) for joint in side if joint} - apart
-        side |= {
-            joint for joint in range(1, model.njoints) if int(model.parents[joint]) in side - {0}
-        } - apart
-        grows = len(side) > before
-    return tuple(sorted(side - {0}))
+        count = len(shank)
+        shank |= {int(model.parents[joint]) for joint in shank if joint} - excluded
+        shank |= {
+            joint for joint in range(1, model.njoints) if int(model.parents[joint]) in shank - {0}
+        } - excluded
+        grows = len(shank) > count
+    return tuple(sorted(shank - {0}))
 
 
-def _hip(femur: Place, path: tuple[int, ...]) -> Place:
-    """Return the frame of the femur's parent joint. If that is a knee joint: the femur's frame."""
-    return femur if femur.joint in path else Place(femur.joint, pin.SE3.Identity())
+def _hip(femur: FixedFrame, path: tuple[int, ...]) -> FixedFrame:
+    """Return the frame of the femur's parent joint, or the femur's frame if it is a knee joint."""
+    return femur if femur.joint in path else FixedFrame(femur.joint, pin.SE3.Identity())
 
 
 def knee_size(anatomy: Anatomy) -> int:

@@ -1,4 +1,4 @@
-"""A knee on a user's model: its parts, and their poses at a configuration."""
+"""The parts of a knee on a user's model, and their poses at a configuration."""
 
 import copy
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,7 +17,7 @@ from tkamb.geometry.frames import (
     sagittal_pose,
 )
 from tkamb.knee.anatomy import find_anatomy
-from tkamb.knee.canonical import Bridge, CanonicalChain, KneePlace, se3
+from tkamb.knee.canonical import Bridge, CanonicalChain, KneePose, se3
 from tkamb.knee.muscles import Muscle, checked_tensions, tension_lines
 from tkamb.knee.parts import (
     Extensor,
@@ -46,7 +46,7 @@ PATELLAR_LIGAMENT = "patellar_ligament"
 class KneeData:
     """Data that a caller passes from call to call to save time; `Knee.create_data` makes it.
 
-    It changes a result at most within the solver's tolerance.
+    Results change at most within the solver's tolerance.
 
     Args:
         data: Pinocchio data of the user's model.
@@ -88,35 +88,35 @@ class AssembledKnee:
         if not 0.0 <= friction <= 1.0:
             raise InputError(f"friction {friction}", "Knee", "give 0 to 1")
         self.model, self.side, self.friction = model, side, float(friction)
-        self.implant, left = implant or Implant(), side == "left"
+        self.implant, is_left = implant or Implant(), side == "left"
         self.anatomy = find_anatomy(
             model, frames or {}, joints, extensor.plane if extensor else None
         )
-        given = surfaces_of(self.implant, left, contact is not None, extensor is not None)
-        insert, placed = placed_insert(self.anatomy, self.implant, given.insert, left)
-        self._surfaces = replace(given, insert=placed)
+        surfaces = surfaces_of(self.implant, is_left, contact is not None, extensor is not None)
+        insert, insert_surface = placed_insert(self.anatomy, self.implant, surfaces.insert, is_left)
+        self._surfaces = replace(surfaces, insert=insert_surface)
         component = self.anatomy.femoral
-        self.chain = CanonicalChain(self.anatomy, left, extensor is not None, component, insert)
-        self.bridge = Bridge(self.anatomy, left, self.chain, component, insert)
+        self.chain = CanonicalChain(self.anatomy, is_left, extensor is not None, component, insert)
+        self.bridge = Bridge(self.anatomy, is_left, self.chain, component, insert)
         self._lines = tension_lines(muscles, self.anatomy)
-        self._take(ligaments)
+        self._set_ligaments(ligaments)
         self.extensor = extensor
         self.extensor_lines: ExtensorLines | None = None
         if extensor is not None:
             self.extensor_lines = extensor_lines(self.bridge, extensor, self._surfaces)
         self.contact: KneeContact | None = None
         if contact is not None:
-            given_contact = prepared_contact(contact, self.implant, self._surfaces, cache)
-            self.contact = given_contact.changed(self.friction)
+            prepared = prepared_contact(contact, self.implant, self._surfaces, cache)
+            self.contact = prepared.changed(self.friction)
 
-    def _take(self, bundles: "Iterable[Ligament]") -> None:
+    def _set_ligaments(self, bundles: "Iterable[Ligament]") -> None:
         self.ligaments = tuple(bundle_on_chain(self.bridge, bundle) for bundle in bundles)
         self._crossing, self._others = crossing_and_others(self.chain, self.ligaments)
 
     def with_ligaments(self, ligaments: "Iterable[Ligament]") -> Self:
         """Return the same knee with other ligaments; everything else is shared."""
         other = copy.copy(self)
-        other._take(ligaments)
+        other._set_ligaments(ligaments)
         return other
 
     def with_contact(self, model: "ContactModel") -> Self:
@@ -163,18 +163,18 @@ class AssembledKnee:
 
     def pose(self, q: Array) -> pin.SE3:
         """Return the pose of the femoral component in the insert frame."""
-        place = self._kinematics(self.create_data_for_kinematics(), q)
-        return se3(mirrored_pose(place.pose) if self.left else place.pose)
+        kinematics = self._kinematics(self.create_data_for_kinematics(), q)
+        return se3(mirrored_pose(kinematics.pose) if self.left else kinematics.pose)
 
     def coordinates(self, q: Array) -> Array:
         """Return the knee coordinates (6,) in the order of `KNEE_COORDINATES`, m and rad.
 
-        They follow Grood and Suntay (`tkamb.geometry.frames`). The coordinates of a left knee are
-        those of its mirror image, with the same clinical signs.
+        The coordinates are those of Grood and Suntay (`tkamb.geometry.frames`). A left knee has the
+        coordinates of its mirror image, with the same clinical signs.
         """
         return self._kinematics(self.create_data_for_kinematics(), q).coordinates
 
-    def at(self, q: Array, data: KneeData) -> KneePlace:
+    def at(self, q: Array, data: KneeData) -> KneePose:
         """Return the pose of the knee at q, and update the placements in `data`."""
         return self._kinematics(data, q)
 
@@ -197,15 +197,15 @@ class AssembledKnee:
             data: from `create_data`.
 
         Returns:
-            The poses, and whether they include the patella. It is absent if its search failed.
+            The poses, and whether they include the patella. It is missing if its search failed.
         """
-        place, patella = replace(self._kinematics(data, q), pose=femur), None
+        kinematics, patella = replace(self._kinematics(data, q), pose=femur), None
         if self.extensor is not None:
             try:
-                patella = self._find_patella(place, data)
+                patella = self._find_patella(kinematics, data)
             except ComputationError:
                 patella = None
-        return self._link_poses(place, patella), patella is not None
+        return self._link_poses(kinematics, patella), patella is not None
 
     def extensor_paths(self, poses: dict[str, Array]) -> dict[str, Array]:
         """Return the paths (n, 3), m, of quadriceps and patellar ligament, insert frame.
@@ -229,14 +229,14 @@ class AssembledKnee:
             raise InputError(f"{name} has the shape {array.shape}", "Knee", f"give ({size},)")
         return array
 
-    def _kinematics(self, data: KneeData, q: Array, v: Array | None = None) -> KneePlace:
+    def _kinematics(self, data: KneeData, q: Array, v: Array | None = None) -> KneePose:
         q = self._check(q, "q", self.model.nq)
         if v is None:
             pin.forwardKinematics(self.model, data.data, q)
         else:
             v = self._check(v, "v", self.model.nv)
             pin.forwardKinematics(self.model, data.data, q, v)
-        return self.bridge.place(data.data)
+        return self.bridge.knee_pose(data.data)
 
     def _need_contact(self) -> "KneeContact":
         if self.contact is None:
@@ -258,28 +258,28 @@ class AssembledKnee:
     def _tensions(self, tensions: Mapping[str, float] | float | None) -> dict[str, float]:
         return checked_tensions(tensions, self._extensor_names, self._lines)
 
-    def _find_patella(self, place: KneePlace, data: KneeData) -> "PatellaState":
+    def _find_patella(self, kinematics: KneePose, data: KneeData) -> "PatellaState":
         lines = self.extensor_lines
         assert lines is not None
         if self._finds_patella:
-            data.patella = solution = lines.solved(place.pose, data.patella)
+            data.patella = solution = lines.solved(kinematics.pose, data.patella)
         else:
-            assert place.patella is not None
-            solution = lines.given(place.pose, place.patella)
+            assert kinematics.patella is not None
+            solution = lines.given(kinematics.pose, kinematics.patella)
         if not solution.status.found:
             raise ComputationError(f"patella lost: {solution.status.value}", "extensor")
         return solution
 
-    def _link_poses(self, place: KneePlace, patella: "PatellaState | None") -> dict[str, Array]:
+    def _link_poses(self, kinematics: KneePose, patella: "PatellaState | None") -> dict[str, Array]:
         """Return link -> pose (4, 4) in the insert frame."""
         poses = {
-            "femur": place.pose,
+            "femur": kinematics.pose,
             "tibia": inverse(self.chain.insert_in_tibia),
             "insert": np.eye(4),
         }
         if patella is not None:
             joint = self.chain.patella_joint_in_femur
-            poses["patella"] = place.pose @ joint @ sagittal_pose(patella.coordinates)
+            poses["patella"] = kinematics.pose @ joint @ sagittal_pose(patella.coordinates)
         return poses
 
     def _with_lines(self, data: KneeData, tensions: Mapping[str, float], forces: Any) -> Any:
@@ -290,12 +290,12 @@ class AssembledKnee:
             tensions: muscle -> tension, N.
             forces: one force per joint; None: zero.
         """
-        pulls = [name for name in self._lines if tensions.get(name, 0.0)]
-        if not pulls:
+        pulling = [name for name in self._lines if tensions.get(name, 0.0)]
+        if not pulling:
             return forces
-        given = [pin.Force.Zero()] * self.model.njoints if forces is None else forces
-        total = [pin.Force(force) for force in given]
-        for name in pulls:
+        loads = [pin.Force.Zero()] * self.model.njoints if forces is None else forces
+        total = [pin.Force(force) for force in loads]
+        for name in pulling:
             for joint, force in self._lines[name].forces(data.data, tensions[name]):
                 total[joint] += force
         return pin.StdVec_Force(total)

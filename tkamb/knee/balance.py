@@ -2,16 +2,17 @@
 
 Let r(q) be the force that drives each coordinate, and K = -dr/dq the stiffness. A step d solves
 (K + lambda I) d = r. lambda is the smallest value with which the step descends and stays inside the
-region. The step is accepted by the ratio W / W_K. W is the work of the forces along the step
-(trapezoidal rule), and W_K is the work that K predicts:
+region. The ratio W / W_K decides whether the step is accepted. W is the work of the forces along
+the step (trapezoidal rule), and W_K is the work that K predicts:
 
     W = (r(q) + r(q + d)) . d / 2          W_K = r(q) . d - d . K d / 2
 
 If the forces have a potential, W is the energy that a step releases. A trial that overshoots into a
-stiff contact has W < 0 and is rejected. Follower loads make K unsymmetric. K may then be stable but
-not positive definite, and work is no measure. In this case the step follows Newton's direction, in
-which |r| falls, and |r| decides whether the step is accepted. A search that does not converge is
-repeated once. In the second search |r| decides for whole Newton steps, and work for shorter steps.
+stiff contact has W < 0 and is rejected. Follower loads make K unsymmetric. An equilibrium may then
+be stable although K is not positive definite, and work does not show progress. In this case the
+search takes Newton steps, and |r| decides whether a step is accepted. A search that does not
+converge is repeated once. In the second search |r| decides for full Newton steps, and work for
+shorter steps.
 
 All coordinates are in metres and all forces in newtons: rotations are scaled by a lever arm.
 
@@ -108,8 +109,8 @@ class Balance:
         trials: number of evaluations of the forces.
         smallest_stiffness: smallest real part of the stiffness' eigenvalues, N/m.
         work: work of the forces along each accepted step, N·m.
-        at_rest: True: converged to the tolerances. False: ended early by `residual_share` or
-            `reach`.
+        converged: True: converged to the tolerances. False: ended early by `residual_share` or
+            `stop_distance`.
     """
 
     coordinates: Array
@@ -120,7 +121,7 @@ class Balance:
     trials: int
     smallest_stiffness: float
     work: tuple[float, ...]
-    at_rest: bool = True
+    converged: bool = True
 
 
 Forces = Callable[[Array], Trial]
@@ -131,7 +132,7 @@ def find_balance(
     start: Array,
     stiffness: Array | None = None,
     residual_share: float = 0.0,
-    reach: float = np.inf,
+    stop_distance: float = np.inf,
 ) -> Balance:
     """Find the coordinates at which all forces are in equilibrium.
 
@@ -141,21 +142,22 @@ def find_balance(
         stiffness: stiffness of an earlier, similar search, shape (n, n), N/m. It saves trials if
             `forces` gives no stiffness.
         residual_share: remaining Newton step, relative to the distance from the initial guess, at
-            which the search ends early; 0: the tolerances alone decide. It is for a search that is
+            which the search ends early; 0: the tolerances alone decide. Use it for a search that is
             repeated under other forces.
-        reach: distance of a coordinate from its initial guess, m, at which the search ends early.
+        stop_distance: distance of a coordinate from its initial guess at which the search ends
+            early, m.
     """
-    result = _Search(forces, np.array(start, float), stiffness, residual_share, reach).run()
+    result = _Search(forces, np.array(start, float), stiffness, residual_share, stop_distance).run()
     if result.status not in (BalanceStatus.RUNS_AWAY, BalanceStatus.NOT_CONVERGED):
         return result
-    # Over the facets of a contact Newton's direction may lead away from the equilibrium. The
+    # Across the facets of a contact Newton's direction may lead away from the equilibrium. The
     # direction of decreasing energy does not.
-    again = _Search(
-        forces, np.array(start, float), stiffness, residual_share, reach, downhill=True
+    second = _Search(
+        forces, np.array(start, float), stiffness, residual_share, stop_distance, downhill=True
     ).run()
-    if again.status is not BalanceStatus.OK:
+    if second.status is not BalanceStatus.OK:
         return result
-    return replace(again, trials=result.trials + again.trials, steps=result.steps + again.steps)
+    return replace(second, trials=result.trials + second.trials, steps=result.steps + second.steps)
 
 
 class _Search:
@@ -165,11 +167,11 @@ class _Search:
         start: Array,
         stiffness: Array | None,
         residual_share: float,
-        reach: float,
+        stop_distance: float,
         downhill: bool = False,
     ) -> None:
         self._forces, self._start, self._downhill = forces, start, downhill
-        self._residual_share, self._reach = residual_share, reach
+        self._residual_share, self._stop_distance = residual_share, stop_distance
         self._trials, self._steps = 0, 0
         self._from_differences, self._steps_since_differences, self._force_unknown = False, 0, False
         self._radius, self._newton_rejected = FIRST_RADIUS, False
@@ -198,8 +200,8 @@ class _Search:
                 return self._end(BalanceStatus.OUT_OF_RANGE)
             if self._converged():
                 return self._end(self._stability())
-            if self._close_enough() or self._travel() > self._reach:
-                return replace(self._end(BalanceStatus.OK), at_rest=False)
+            if self._close_enough() or self._travel() > self._stop_distance:
+                return replace(self._end(BalanceStatus.OK), converged=False)
             if self._travel() > BALANCE.max_travel:
                 return self._end(BalanceStatus.RUNS_AWAY)
             if self._radius < NARROWEST_RADIUS and (self._exact_tangent or self._from_differences):
@@ -214,7 +216,7 @@ class _Search:
         )
 
     def _step(self) -> None:
-        step, part = self._next()
+        step, share = self._next()
         trial = self._at(self.x + step)
         self._steps, self._steps_since_differences = (
             self._steps + 1,
@@ -232,14 +234,14 @@ class _Search:
             self._radius = 0.25 * length
             return
         # Relative reduction of the residual by the step.
-        fall = 1.0 - float(np.linalg.norm(trial.force) / np.linalg.norm(self.force))
-        # A share `part` of Newton's step should reduce the residual by the same share. Half of this
+        reduction = 1.0 - float(np.linalg.norm(trial.force) / np.linalg.norm(self.force))
+        # A given share of Newton's step should reduce the residual by the same share. Half of this
         # reduction is enough to accept the step, whatever its work.
-        helps = part > 0 and fall > 0.5 * part
-        ratio = 1.0 if helps else work / predicted if predicted > 0 else -1.0
+        reduces = share > 0 and reduction > 0.5 * share
+        ratio = 1.0 if reduces else work / predicted if predicted > 0 else -1.0
         accepted = ratio > 0.05
         # |r| may rise across a kink of the contact: the next step is then a bounded step.
-        self._newton_rejected = part > 0 and not accepted
+        self._newton_rejected = share > 0 and not accepted
         if not self._exact_tangent:
             self._learn(step, trial)
         if ratio < 0.25:
@@ -266,7 +268,7 @@ class _Search:
                 )
 
     def _next(self) -> tuple[Array, float]:
-        """Return the next step and its share of Newton's step; 0: the work decides."""
+        """Return the next step, and its share of Newton's step; 0: it is no Newton step."""
         symmetric, smallest_stiffness = smallest_eigenvalues(self.stiffness)
         if symmetric > 0 or smallest_stiffness <= 0 or self._newton_rejected:
             return bounded_step(self.stiffness, self.force, self._radius), 0.0
@@ -274,10 +276,10 @@ class _Search:
         newton = newton_step(self.stiffness, self.force)
         if newton is None:
             return bounded_step(self.stiffness, self.force, self._radius), 0.0
-        part = min(1.0, self._radius / float(np.linalg.norm(newton)))
-        if self._downhill and part < 1.0:
+        share = min(1.0, self._radius / float(np.linalg.norm(newton)))
+        if self._downhill and share < 1.0:
             return bounded_step(self.stiffness, self.force, self._radius), 0.0
-        return np.asarray(part * newton), part
+        return np.asarray(share * newton), share
 
     def _at(self, x: Array) -> Trial:
         self._trials += 1
@@ -305,9 +307,9 @@ class _Search:
     def _learn(self, step: Array, trial: Trial) -> None:
         """Correct the stiffness along a step (Broyden 1965, doi:10.2307/2003941).
 
-        With an approximate stiffness at both ends, the update corrects their mean. If the change of
+        If both ends have an approximate stiffness, the update corrects their mean. If the change of
         force differs too much from its prediction (contact was made or lost), all updates are
-        discarded. They are kept if finite differences have just been computed.
+        discarded, unless the stiffness comes from new finite differences.
         """
         expected = self.stiffness @ step
         if self._model_stiffness is not None and trial.stiffness is not None:
@@ -338,11 +340,11 @@ class _Search:
     def _close_enough(self) -> bool:
         """Return whether the remaining step is small against the distance from the guess."""
         # Newton's step estimates the remaining distance.
-        way = self._residual_share * float(np.linalg.norm(self.x - self._start))
-        if way == 0.0 or self._smallest_stiffness() <= BALANCE.least_stiffness:
+        distance = self._residual_share * float(np.linalg.norm(self.x - self._start))
+        if distance == 0.0 or self._smallest_stiffness() <= BALANCE.least_stiffness:
             return False
         step = float(np.linalg.norm(np.linalg.solve(self.stiffness, self.force)))
-        return step < min(way, self._radius)
+        return step < min(distance, self._radius)
 
     def _stability(self) -> BalanceStatus:
         if (

@@ -31,7 +31,7 @@ from tkamb.geometry.frames import (
     knee_coordinates,
     mirrored_pose,
 )
-from tkamb.knee.anatomy import Anatomy, Place, knee_size
+from tkamb.knee.anatomy import Anatomy, FixedFrame, knee_size
 from tkamb.knee.chain import Chain, ChainMotion, ChainState
 from tkamb.knee.load import LinkPoint, PointForces, wrenches
 
@@ -70,7 +70,7 @@ class CanonicalChain(Chain):
     """The canonical chain of one knee, described at the top of this module.
 
     Args:
-        anatomy: where the knee is in the user's model.
+        anatomy: the knee in the user's model.
         is_left: whether the knee is a left one.
         with_patella: whether the chain has a patella.
         component: axes of the femoral component, fixed to the femur's joint.
@@ -82,8 +82,8 @@ class CanonicalChain(Chain):
         anatomy: Anatomy,
         is_left: bool,
         with_patella: bool,
-        component: Place,
-        insert: Place,
+        component: FixedFrame,
+        insert: FixedFrame,
     ) -> None:
         self.joints = KNEE_JOINT_NAMES + (PATELLA_JOINT_NAMES if with_patella else ())
         self._left = is_left
@@ -107,10 +107,10 @@ class CanonicalChain(Chain):
                 placement = pin.SE3.Identity()
             _add_body(model, "patella", joint)
             if anatomy.patella is not None:
-                own = user.inertias[anatomy.patella.joint]
-                model.inertias[joint] = self._inertia(own, anatomy.patella.placement)
+                inertia_of_patella = user.inertias[anatomy.patella.joint]
+                model.inertias[joint] = self._inertia(inertia_of_patella, anatomy.patella.placement)
         self._columns = [model.joints[model.getJointId(name)].idx_v for name in self.joints]
-        self._take(model)
+        self._set_model(model)
 
     def _right(self, vector: Array) -> Array:
         return mirrored_spatial(vector) if self._left else vector
@@ -121,10 +121,14 @@ class CanonicalChain(Chain):
 
     def _inertia(self, inertia: pin.Inertia, placement: pin.SE3) -> pin.Inertia:
         """Return the inertia of a body in the axes of a frame on it."""
-        own = inertia.se3Action(placement.inverse())
+        inertia_in_frame = inertia.se3Action(placement.inverse())
         if not self._left:
-            return own
-        return pin.Inertia(own.mass, MIRROR @ own.lever, MIRROR @ own.inertia @ MIRROR)
+            return inertia_in_frame
+        return pin.Inertia(
+            inertia_in_frame.mass,
+            MIRROR @ inertia_in_frame.lever,
+            MIRROR @ inertia_in_frame.inertia @ MIRROR,
+        )
 
 
 _KNEE_JOINTS = (
@@ -139,12 +143,12 @@ _PATELLA_JOINTS = (pin.JointModelPX, pin.JointModelPY, pin.JointModelRZ)
 
 
 def _add_body(model: pin.Model, name: str, joint: int, placement: pin.SE3 | None = None) -> None:
-    place = pin.SE3.Identity() if placement is None else placement
-    model.addFrame(pin.Frame(name, joint, 0, place, pin.FrameType.BODY))
+    pose_in_joint = pin.SE3.Identity() if placement is None else placement
+    model.addFrame(pin.Frame(name, joint, 0, pose_in_joint, pin.FrameType.BODY))
 
 
 @dataclass(frozen=True, eq=False)
-class KneePlace:
+class KneePose:
     """The pose of a knee at one instant. A left knee is described by its mirror image.
 
     Args:
@@ -162,7 +166,7 @@ class Bridge:
     """Converts poses, motions and loads between the user's model and the canonical chain.
 
     Args:
-        anatomy: where the knee is in the user's model.
+        anatomy: the knee in the user's model.
         is_left: whether the knee is a left one.
         chain: the canonical chain.
         component: axes of the femoral component, fixed to the femur's joint.
@@ -170,7 +174,12 @@ class Bridge:
     """
 
     def __init__(
-        self, anatomy: Anatomy, is_left: bool, chain: Chain, component: Place, insert: Place
+        self,
+        anatomy: Anatomy,
+        is_left: bool,
+        chain: Chain,
+        component: FixedFrame,
+        insert: FixedFrame,
     ) -> None:
         self.anatomy, self.left, self.chain = anatomy, is_left, chain
         self.component, self.insert = component, insert
@@ -193,10 +202,10 @@ class Bridge:
         elif point.link == "patella" and "patella_ap" in self.chain.joints:
             position = np.array(point.position)
             return LinkPoint("patella", MIRROR @ position if self.left else position)
-        place = anatomy.frame(point.link)
+        frame = anatomy.frame(point.link)
         for link, base in links:
-            if place.joint == base.joint:
-                local = (base.placement.inverse() * place.placement).act(point.position)
+            if frame.joint == base.joint:
+                local = (base.placement.inverse() * frame.placement).act(point.position)
                 return LinkPoint(link, MIRROR @ local if self.left else np.array(local))
         raise InputError(
             f"frame '{point.link}' is fixed to neither tibia, femur nor patella",
@@ -204,7 +213,7 @@ class Bridge:
             "a line that leaves the knee is a muscle: Knee(..., muscles=[...])",
         )
 
-    def place(self, data: Any) -> KneePlace:
+    def knee_pose(self, data: Any) -> KneePose:
         """Return the pose of the knee.
 
         Args:
@@ -216,11 +225,13 @@ class Bridge:
         patella = None
         if self.anatomy.patella is not None and "patella_ap" in self.chain.joints:
             plane = data.oMi[self.anatomy.plane.joint] * self.anatomy.plane.placement
-            own = data.oMi[self.anatomy.patella.joint] * self.anatomy.patella.placement
-            relative = self._right(plane.actInv(own))
-            turn = np.arctan2(relative[1, 0], relative[0, 0])
-            patella = np.array([relative[0, 3], relative[1, 3], turn])
-        return KneePlace(pose, knee_coordinates(pose), patella)
+            patella_placement = (
+                data.oMi[self.anatomy.patella.joint] * self.anatomy.patella.placement
+            )
+            relative = self._right(plane.actInv(patella_placement))
+            rotation = np.arctan2(relative[1, 0], relative[0, 0])
+            patella = np.array([relative[0, 3], relative[1, 3], rotation])
+        return KneePose(pose, knee_coordinates(pose), patella)
 
     def twist(self, data: Any) -> Array:
         """Return the femur's twist (6,) relative to the insert, at the insert's origin and axes.
@@ -230,10 +241,10 @@ class Bridge:
         """
         insert = data.oMi[self.insert.joint] * self.insert.placement
         total = np.zeros(6)
-        for place, sign in ((self.component, 1.0), (self.insert, -1.0)):
-            if place.joint:
-                to_insert = insert.actInv(data.oMi[place.joint])
-                total += sign * to_insert.act(data.v[place.joint]).vector
+        for frame, sign in ((self.component, 1.0), (self.insert, -1.0)):
+            if frame.joint:
+                to_insert = insert.actInv(data.oMi[frame.joint])
+                total += sign * to_insert.act(data.v[frame.joint]).vector
         return mirrored_spatial(total) if self.left else total
 
     def motion(self, data: Any, patella: bool) -> ChainMotion:
@@ -244,70 +255,79 @@ class Bridge:
             patella: whether the chain has a patella. If the user's model has none, its coordinates
                 and rates are zero.
         """
-        anatomy, place = self.anatomy, self.place(data)
-        tibia, still = anatomy.tibia, pin.Motion.Zero()
+        anatomy, knee = self.anatomy, self.knee_pose(data)
+        tibia, zero = anatomy.tibia, pin.Motion.Zero()
         pose = self._right(data.oMi[tibia.joint] * tibia.placement)
         rates = [
-            tibia.placement.actInv(still if not tibia.joint else derivative[tibia.joint]).vector
+            tibia.placement.actInv(zero if not tibia.joint else derivative[tibia.joint]).vector
             for derivative in (data.v, data.a)
         ]
         q = pin.neutral(self.chain.model)
-        q[7:13] = place.coordinates
+        q[7:13] = knee.coordinates
         joints = np.zeros((3, 9 if patella else 6))
-        knee = slice(0, 6)
-        joints[:, knee] = self._rates(q, place.coordinates, data, tibia, self.component, knee)
-        if patella and place.patella is not None:
+        knee_rows = slice(0, 6)
+        joints[:, knee_rows] = self._rates(
+            q, knee.coordinates, data, tibia, self.component, knee_rows
+        )
+        if patella and knee.patella is not None:
             assert anatomy.patella is not None
-            q[13:16] = place.patella
-            own = slice(6, 9)
-            joints[:, own] = self._rates(
-                q, place.patella, data, self.component, anatomy.patella, own
+            q[13:16] = knee.patella
+            patella_rows = slice(6, 9)
+            joints[:, patella_rows] = self._rates(
+                q, knee.patella, data, self.component, anatomy.patella, patella_rows
             )
         tibia_rates = [mirrored_spatial(rate) if self.left else rate for rate in rates]
         return ChainMotion(pose, tibia_rates[0], tibia_rates[1], joints)
 
     def _rates(
-        self, q: Array, place: Array, data: Any, base: Place, follower: Place, own: slice
+        self,
+        q: Array,
+        coordinates: Array,
+        data: Any,
+        base: FixedFrame,
+        follower: FixedFrame,
+        rows: slice,
     ) -> Array:
         """Return coordinates, rates and accelerations (3, n) between two bodies.
 
         Args:
             q: configuration of the chain, with its root at the neutral pose, shape (nq,).
-            place: coordinates between the two bodies, shape (n,), m and rad.
+            coordinates: coordinates between the two bodies, shape (n,), m and rad.
             data: Pinocchio data of the user's model.
             base: frame on the parent body.
             follower: frame on the child body.
-            own: slice of these coordinates in the chain's joint coordinates.
+            rows: slice of these coordinates in the chain's joint coordinates.
         """
         twist, rate = self._relative(data, base, follower)
         model, cache = self.chain.model, self._chain_data
-        joint = self._last if own.start == 0 else model.njoints - 1
-        columns = slice(6 + own.start, 6 + own.stop)
+        joint = self._last if rows.start == 0 else model.njoints - 1
+        columns = slice(6 + rows.start, 6 + rows.stop)
         jacobian = pin.computeJointJacobian(model, cache, q, joint)[:, columns]
         v = np.zeros(model.nv)
         v[columns] = _solved(jacobian, twist)
+        # With zero joint accelerations the acceleration of the child body is J' qd.
         pin.forwardKinematics(model, cache, q, v, np.zeros(model.nv))
         acceleration = _solved(jacobian, rate - cache.a[joint].vector)
-        return np.stack([place, v[columns], acceleration])
+        return np.stack([coordinates, v[columns], acceleration])
 
-    def _relative(self, data: Any, base: Place, follower: Place) -> tuple[Array, Array]:
-        """Return s and s' (6,) of the module's equations, in the axes of the child body."""
-        placement, still = data.oMi[follower.joint] * follower.placement, pin.Motion.Zero()
-        own, own_rate = (
-            follower.placement.actInv(still if not follower.joint else values[follower.joint])
+    def _relative(self, data: Any, base: FixedFrame, follower: FixedFrame) -> tuple[Array, Array]:
+        """Return s and s' (6,) of the equations above, in the axes of the child body."""
+        placement, zero = data.oMi[follower.joint] * follower.placement, pin.Motion.Zero()
+        child_twist, child_rate = (
+            follower.placement.actInv(zero if not follower.joint else values[follower.joint])
             for values in (data.v, data.a)
         )
-        to_moved = placement.actInv(data.oMi[base.joint])
+        to_child = placement.actInv(data.oMi[base.joint])
         base_twist, base_rate = (
-            still if not base.joint else to_moved.act(values[base.joint])
+            zero if not base.joint else to_child.act(values[base.joint])
             for values in (data.v, data.a)
         )
-        twist = own - base_twist
-        rate = own_rate - base_rate - own.cross(twist)
-        pair = twist.vector, rate.vector
+        twist = child_twist - base_twist
+        rate = child_rate - base_rate - child_twist.cross(twist)
+        vectors = twist.vector, rate.vector
         if not self.left:
-            return pair
-        return mirrored_spatial(pair[0]), mirrored_spatial(pair[1])
+            return vectors
+        return mirrored_spatial(vectors[0]), mirrored_spatial(vectors[1])
 
     def relative_jacobian(self, data: Any, q: Array) -> Array:
         """Return J (6, nv) of `tkamb.Knee.relative_jacobian`, and update `data`."""
@@ -315,10 +335,10 @@ class Bridge:
         pin.computeJointJacobians(model, data, q)
         insert = data.oMi[self.insert.joint] * self.insert.placement
         total = np.zeros((6, model.nv))
-        for place, sign in ((self.component, 1.0), (self.insert, -1.0)):
-            if place.joint:
-                local = pin.getJointJacobian(model, data, place.joint, pin.ReferenceFrame.LOCAL)
-                to_insert = insert.actInv(data.oMi[place.joint]).toActionMatrix()
+        for frame, sign in ((self.component, 1.0), (self.insert, -1.0)):
+            if frame.joint:
+                local = pin.getJointJacobian(model, data, frame.joint, pin.ReferenceFrame.LOCAL)
+                to_insert = insert.actInv(data.oMi[frame.joint]).toActionMatrix()
                 total += sign * to_insert @ local.reshape(6, -1)
         return total
 
@@ -360,14 +380,14 @@ class Bridge:
             f"the {knee_size(self.anatomy)} degrees of freedom between tibia and femur do not "
             "reach the pose of equilibrium",
             "Knee",
-            "give the knee of the model six (a pin.JointModelFreeFlyer, or six single joints)",
+            "give the knee of the model six degrees of freedom, such as a pin.JointModelFreeFlyer",
         )
 
     def shank_needs(self, data: Any) -> Array:
-        """Return the wrench (6,) for the inertia and weight of the shank, insert frame.
+        """Return the wrench (6,) that inertia and weight of the shank require, insert frame.
 
-        It is the sum over the shank's bodies. If the tibia is fixed to the universe, it is the
-        negative of the same sum over all bodies above the knee.
+        The wrench is the sum over the shank's bodies. If the tibia is fixed to the universe, it is
+        the negative of the sum over all bodies above the knee.
 
         Args:
             data: Pinocchio data, after `pin.forwardKinematics(model, data, q, v, a)`.
@@ -382,7 +402,8 @@ class Bridge:
     def on_shank(self, data: Any, external: Any) -> PointForces:
         """Return the sum of the external forces on the shank, at the insert's origin.
 
-        If the tibia is fixed to the universe, it is the negative of the sum above the knee.
+        If the tibia is fixed to the universe, the result is the negative of the sum of the forces
+        above the knee.
 
         Args:
             data: Pinocchio data of the user's model, with joint placements up to date.
@@ -400,9 +421,9 @@ class Bridge:
         total *= -1.0 if self.anatomy.fixed else 1.0
         return mirrored_spatial(total) if self.left else total
 
-    def external_on(self, place: Place | None, data: Any, external: Any) -> Array:
+    def external_on(self, frame: FixedFrame | None, data: Any, external: Any) -> Array:
         """Return the external wrench (6,) on the body that a frame is fixed to, insert frame."""
-        joint = 0 if place is None else place.joint
+        joint = 0 if frame is None else frame.joint
         if external is None or not joint:
             return np.zeros(6)
         insert = data.oMi[self.insert.joint] * self.insert.placement
@@ -422,15 +443,15 @@ class Bridge:
         forces = [pin.Force.Zero() for _ in range(self.anatomy.model.njoints)]
         insert = data.oMi[self.insert.joint] * self.insert.placement
         patella = self.anatomy.patella
-        homes = {
+        joints = {
             "tibia": self.insert.joint,
             "femur": self.component.joint,
             "patella": self.component.joint if patella is None else patella.joint,
         }
         for link, wrench in summed(loads).items():
-            joint = homes[link]
-            own = mirrored_spatial(wrench) if self.left else wrench
-            forces[joint] += data.oMi[joint].actInv(insert).act(pin.Force(own))
+            joint = joints[link]
+            user_wrench = mirrored_spatial(wrench) if self.left else wrench
+            forces[joint] += data.oMi[joint].actInv(insert).act(pin.Force(user_wrench))
         return pin.StdVec_Force(forces)
 
     def _placed(self, pose: Array) -> pin.SE3:
@@ -455,7 +476,7 @@ def summed(loads: "dict[str, Array] | list[PointForces]") -> dict[str, Array]:
 def _solved(jacobian: Array, twist: Array) -> Array:
     """Return the joint rates that produce a twist (6,).
 
-    With fewer than six joints it is the least-squares solution. It is NaN for inputs that are NaN.
+    With fewer than six joints the result is the least-squares solution. NaN inputs give NaN.
     """
     if not (np.isfinite(jacobian).all() and np.isfinite(twist).all()):
         return np.full(jacobian.shape[1], np.nan)
@@ -472,7 +493,7 @@ def canonical_state(
     Args:
         chain: the canonical chain.
         motion: motion of the chain.
-        shank: wrench for the inertia and weight of the shank, shape (6,), insert frame.
+        shank: wrench that inertia and weight of the shank require, shape (6,), insert frame.
         thigh: external wrench on the thigh, shape (6,), insert frame.
         patella: external wrench on the patella, shape (6,), insert frame.
     """

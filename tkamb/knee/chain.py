@@ -1,7 +1,7 @@
 """The rigid-body chain in Pinocchio: it turns a motion into inertial forces and load columns.
 
-The root is a free joint at the tibia, and the measured ground reaction is a load. Other joints of
-the URDF, such as the ankle, are locked.
+The root is a free joint at the tibia, and the measured ground reaction is a load on it. All joints
+other than knee and patella, such as the ankle, are locked.
 """
 
 import copy
@@ -65,7 +65,7 @@ class Chain:
         # The laboratory's y points up.
         model.gravity = pin.Motion(np.array([0.0, -gravity, 0.0]), np.zeros(3))
         self._columns = [model.joints[model.getJointId(name)].idx_v for name in self.joints]
-        self._take(model)
+        self._set_model(model)
 
     def changed(
         self, mass_factor: float, insert_shift: Array, insert_turn: Array | None = None
@@ -88,7 +88,7 @@ class Chain:
         placement = model.jointPlacements[base]
         turn = np.eye(3) if insert_turn is None else insert_turn
         model.jointPlacements[base] = placement * pin.SE3(turn, insert_shift)
-        other._take(model)
+        other._set_model(model)
         return other
 
     def scaled(self, length: float) -> "Chain":
@@ -110,10 +110,10 @@ class Chain:
             frame.placement = pin.SE3(
                 frame.placement.rotation, length * frame.placement.translation
             )
-        other._take(model)
+        other._set_model(model)
         return other
 
-    def _take(self, model: pin.Model) -> None:
+    def _set_model(self, model: pin.Model) -> None:
         """Use a model for this chain, and store the poses of insert and tibia in its root."""
         self.model = model
         frames = enumerate(model.frames)
@@ -126,7 +126,7 @@ class Chain:
         """Return Pinocchio's id of a link's frame.
 
         Raises:
-            InputError: no such link.
+            InputError: the link does not exist.
         """
         if link not in self._frames:
             names = [f.name for f in self.model.frames if f.type == pin.FrameType.BODY]
@@ -153,9 +153,9 @@ class Chain:
 
     def carrier(self, link: str) -> str:
         """Return the name of the body that a link is fixed to: tibia, femur or patella."""
-        own = self.model.frames[self.frame_id(link)].parentJoint
+        joint = self.model.frames[self.frame_id(link)].parentJoint
         for base in ("tibia", "femur", "patella"):
-            if self.model.frames[self.frame_id(base)].parentJoint == own:
+            if self.model.frames[self.frame_id(base)].parentJoint == joint:
                 return base
         raise InputError(f"link '{link}' is fixed to neither tibia, femur nor patella", "URDF")
 
@@ -166,20 +166,20 @@ class Chain:
             Mass, kg; centre of mass (3,), m; inertia tensor (3, 3) about that centre, kg·m².
         """
         frame = self.model.frames[self.frame_id(link)]
-        whole = self.model.inertias[frame.parentJoint].se3Action(frame.placement.inverse())
-        return float(whole.mass), np.array(whole.lever), np.array(whole.inertia)
+        inertia = self.model.inertias[frame.parentJoint].se3Action(frame.placement.inverse())
+        return float(inertia.mass), np.array(inertia.lever), np.array(inertia.inertia)
 
     def on_shank(self, link: str) -> bool:
         """Return whether a link is fixed to the tibia."""
-        ends = [self.model.frames[self.frame_id(name)].parentJoint for name in (link, "tibia")]
-        return bool(ends[0] == ends[1])
+        joints = [self.model.frames[self.frame_id(name)].parentJoint for name in (link, "tibia")]
+        return bool(joints[0] == joints[1])
 
     def knee_columns(self) -> list[int]:
         """Return the rows of the six knee coordinates in the generalised force."""
         return self._columns[:6]
 
     def patella_columns(self) -> list[int]:
-        """Return the rows of the three patella coordinates; empty: it is fixed to the femur."""
+        """Return the rows of the three patella coordinates; empty: a patella fixed to the femur."""
         return self._columns[6:]
 
     def at(self, motion: ChainMotion) -> "ChainState":
@@ -246,14 +246,14 @@ class ChainState:
         acting = wrenches(loads)
         links = [load.link for load in loads]
         for link in sorted(set(links)):
-            own = [n for n, name in enumerate(links) if name == link]
+            rows = [n for n, name in enumerate(links) if name == link]
             on_link = np.zeros((len(groups), 6))
-            np.add.at(on_link, column[own], acting[own])
+            np.add.at(on_link, column[rows], acting[rows])
             total += self._jacobian(link).T @ on_link.T
         return total
 
     def add_need(self, link: str, wrench: Array) -> None:
-        """Add a wrench (6,) to the wrench that the sum of all loads must exert on a link.
+        """Add a wrench (6,) to the wrench that all loads together must exert on a link.
 
         Args:
             link: name of the link.

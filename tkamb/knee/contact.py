@@ -1,7 +1,7 @@
 """The femorotibial contact of a knee at one pose: wrench, friction, stiffness and damping.
 
-All vectors are in the insert frame of a right knee. A twist or small displacement (6,) describes
-the femoral component. Its linear part (m/s or m) is at the insert's origin; the rotation follows.
+All vectors are in the insert frame of a right knee. A twist or a small displacement (6,) of the
+femoral component has the linear part at the insert's origin (m/s or m), then the rotation.
 """
 
 from collections.abc import Callable
@@ -72,8 +72,8 @@ class KneeContact:
         """
         if modulus_factor == 1.0:
             return KneeContact(self.model, self.pair, friction, self._state)
-        own = self.pair.material
-        stiffer = replace(own, young_modulus=own.young_modulus * modulus_factor)
+        material = self.pair.material
+        stiffer = replace(material, young_modulus=material.young_modulus * modulus_factor)
         return KneeContact(self.model, self.pair.of_material(stiffer), friction)
 
     def probe(self, start: Guess | None = None) -> Any:
@@ -88,27 +88,27 @@ class KneeContact:
         model = replace(self.model, tolerance=self._settings.tolerance)  # type: ignore[type-var]
         return model.probe(self.state, start)
 
-    def at(self, probe: Any, place: Array) -> ProbedContact:
+    def at(self, probe: Any, femur_pose: Array) -> ProbedContact:
         """Return the contact at a pose (4, 4).
 
         Raises:
             ComputationError: the model is out of its range at the pose, or has not converged.
         """
-        if not np.isfinite(place).all():
+        if not np.isfinite(femur_pose).all():
             raise ComputationError("the pose of the femur is not finite", "contact")
-        contact: ProbedContact = probe.at(place)
+        contact: ProbedContact = probe.at(femur_pose)
         if not contact.known:
-            raise ComputationError(self._why(place), "contact")
+            raise ComputationError(self._why(femur_pose), "contact")
         return contact
 
-    def _why(self, place: Array) -> str:
-        """Return words that explain why the model failed at a pose (4, 4)."""
-        result = self.model.evaluate(self.state, place)
-        words = "; ".join(result.flags) or result.status.value.replace("_", " ")
+    def _why(self, femur_pose: Array) -> str:
+        """Return the reason why the model failed at a pose (4, 4)."""
+        result = self.model.evaluate(self.state, femur_pose)
+        reason = "; ".join(result.flags) or result.status.value.replace("_", " ")
         if result.status is ContactStatus.OK:
-            words = "not converged"
-        depth = self.pair.approach(place)
-        return f"{self.model.name}: {words} (approach {depth * 1e3:.3g} mm)"
+            reason = "not converged"
+        depth = self.pair.approach(femur_pose)
+        return f"{self.model.name}: {reason} (approach {depth * 1e3:.3g} mm)"
 
     def wrench(self, contact: ProbedContact, twist: Array) -> Array:
         """Return the wrench (6,) on the insert, including friction.
@@ -121,14 +121,16 @@ class KneeContact:
         for load in contact.loads:
             total += load.wrench
             if self.friction:
-                total += load.force * self._rubbing(load, twist)
+                total += load.force * self._friction_wrench(load, twist)
         return total
 
-    def _rubbing(self, load: CondyleWrench, twist: Array) -> Array:
+    def _friction_wrench(self, load: CondyleWrench, twist: Array) -> Array:
         """Return the wrench (6,) of friction on the insert per unit force of a condyle."""
         sliding = twist[:3] + cross(twist[3:], load.point)
-        touch = CondylePoint(load.point, load.normal, sliding, 0.0)
-        return wrench_of(touch.point, touch.normal - touch.direction(self.friction))
+        contact_point = CondylePoint(load.point, load.normal, sliding, 0.0)
+        return wrench_of(
+            contact_point.point, contact_point.normal - contact_point.direction(self.friction)
+        )
 
     def damping(self, contact: ProbedContact, twist: Array) -> Array:
         """Return the derivative (6, 6) of the wrench on the insert with respect to the twist.
@@ -144,43 +146,45 @@ class KneeContact:
             sliding = point_jacobian @ twist
             tangential = sliding - (sliding @ normal) * normal
             speed = float(np.sqrt(tangential @ tangential + CONTACT_POINT.standstill_speed**2))
-            across = np.eye(3) - np.outer(normal, normal)
-            slope = across / speed - np.outer(tangential, tangential) / speed**3
+            projector = np.eye(3) - np.outer(normal, normal)
+            derivative = projector / speed - np.outer(tangential, tangential) / speed**3
             # Chain rule: the twist gives the velocity of the contact point, and this the friction.
-            total += self.friction * load.force * point_jacobian.T @ slope @ point_jacobian
+            total += self.friction * load.force * point_jacobian.T @ derivative @ point_jacobian
         return total
 
     def stiffness(
-        self, probe: Any, place: Array, contact: ProbedContact, twist: Array, exact: bool
+        self, probe: Any, femur_pose: Array, contact: ProbedContact, twist: Array, exact: bool
     ) -> Array:
         """Return the derivative (6, 6) of the wrench on the insert by a displacement of the femur.
 
         Args:
-            probe: probe of the model, used as warm start.
-            place: pose of the femoral component, shape (4, 4).
+            probe: probe of the model; its state is the warm start.
+            femur_pose: pose of the femoral component, shape (4, 4).
             contact: the contact at this pose.
             twist: constant twist of the femur, shape (6,).
             exact: True: central differences replace an approximate tangent of the model.
         """
-        # Friction turns with the contact normal. The model's tangent does not contain this effect,
-        # so the exact stiffness with friction needs finite differences.
-        rubs = bool(self.friction and np.any(twist) and contact.loads)
-        if contact.tangent and not (exact and (rubs or not contact.exact)):
+        # The friction force rotates with the contact normal. The model's tangent does not contain
+        # this effect, so the exact stiffness with friction needs finite differences.
+        has_friction = bool(self.friction and np.any(twist) and contact.loads)
+        if contact.tangent and not (exact and (has_friction or not contact.exact)):
             total = np.zeros((6, 6))
             for load in contact.loads:
                 assert load.stiffness is not None
                 total += load.stiffness
-                if rubs:
-                    pressed = -load.normal @ load.stiffness[:3]
-                    total += np.outer(self._rubbing(load, twist), pressed)
+                if has_friction:
+                    normal_stiffness = -load.normal @ load.stiffness[:3]
+                    total += np.outer(self._friction_wrench(load, twist), normal_stiffness)
             return total
         precise = self.precise_probe(getattr(probe, "start", None))
-        self.at(precise, place)
+        self.at(precise, femur_pose)
         settings = self._settings
         if contact.tangent and contact.exact and not hasattr(self.model, "tolerance"):
             settings = replace(settings, step=settings.exact_step)
         return differences(
-            lambda moved: self.wrench(self.at(precise, moved), twist), place, settings
+            lambda displaced_pose: self.wrench(self.at(precise, displaced_pose), twist),
+            femur_pose,
+            settings,
         )
 
 
@@ -190,38 +194,42 @@ def _cross_matrix(vector: Array) -> Array:
 
 
 def batch_differences(
-    wrenches: Callable[[Array], Array], place: Array, settings: DifferenceSettings
+    wrenches: Callable[[Array], Array], femur_pose: Array, settings: DifferenceSettings
 ) -> Array:
-    """Return the result of `differences` for a function of all poses (12, 4, 4) at once."""
+    """Return the result of `differences` for a function of many poses (n, 4, 4) at once."""
     sizes = settings.step * np.array([1.0, 1.0, 1.0, *np.full(3, 1.0 / settings.arm)])
     steps = np.concatenate([np.diag(sizes), -np.diag(sizes)])
-    turns = Rotation.from_rotvec(steps[:, 3:]).as_matrix()
-    values = wrenches(pose(turns @ place[:3, :3], turns @ place[:3, 3] + steps[:, :3]))
+    rotations = Rotation.from_rotvec(steps[:, 3:]).as_matrix()
+    values = wrenches(
+        pose(rotations @ femur_pose[:3, :3], rotations @ femur_pose[:3, 3] + steps[:, :3])
+    )
     return ((values[:6] - values[6:]) / (2.0 * sizes[:, None])).T
 
 
 def differences(
-    wrench: Callable[[Array], Array], place: Array, settings: DifferenceSettings
+    wrench: Callable[[Array], Array], femur_pose: Array, settings: DifferenceSettings
 ) -> Array:
     """Return the derivative (6, 6) of a wrench by a small displacement, by central differences.
 
     Args:
         wrench: function of a pose (4, 4) that returns a wrench (6,).
-        place: pose at which the wrench is differentiated, shape (4, 4).
+        femur_pose: pose at which the wrench is differentiated, shape (4, 4).
         settings: steps of the differences.
     """
     columns = []
     for k in range(6):
         size = settings.step if k < 3 else settings.step / settings.arm
-        ends = [wrench(displaced(place, sign * size * np.eye(6)[k])) for sign in (1.0, -1.0)]
-        columns.append((ends[0] - ends[1]) / (2.0 * size))
+        wrenches = [
+            wrench(displaced(femur_pose, sign * size * np.eye(6)[k])) for sign in (1.0, -1.0)
+        ]
+        columns.append((wrenches[0] - wrenches[1]) / (2.0 * size))
     return np.array(columns).T
 
 
-def displaced(place: Array, displacement: Array) -> Array:
+def displaced(femur_pose: Array, displacement: Array) -> Array:
     """Return a pose (4, 4) moved by a displacement (6,): translation, then rotation vector.
 
     The rotation is about the insert's origin. All vectors are in the insert frame.
     """
-    turn = Rotation.from_rotvec(displacement[3:]).as_matrix()
-    return pose(turn @ place[:3, :3], turn @ place[:3, 3] + displacement[:3])
+    rotation = Rotation.from_rotvec(displacement[3:]).as_matrix()
+    return pose(rotation @ femur_pose[:3, :3], rotation @ femur_pose[:3, 3] + displacement[:3])

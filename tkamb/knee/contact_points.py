@@ -18,8 +18,8 @@ class ContactPointSettings:
     """Limits of lift-off, gap and sliding speed of the condyles."""
 
     lift_off_angle: float = 0.5 * DEGREE
-    """rad: a condyle is lifted off if the coronal angle of the two gaps exceeds this and its gap
-    exceeds `lift_off_gap`. Source: error of fluoroscopy (Sharma 2008, 4.3)."""
+    """rad: a condyle is lifted off if the coronal angle from both gaps exceeds this angle, and the
+    condyle's gap exceeds `lift_off_gap`. Source: error of fluoroscopy (Sharma 2008, 4.3)."""
     lift_off_gap: float = 0.5 * MILLIMETRE
     """m: gap above which a condyle may be lifted off, see `lift_off_angle`. Source: error of
     fluoroscopy (Sharma 2008, 4.3)."""
@@ -53,7 +53,7 @@ class CondylePoint:
     def direction(self, friction: float) -> Array:
         """Return the contact force on the femur (3,) per unit normal force.
 
-        It is n - mu t with t = v / sqrt(|v|² + v0²) for the tangential velocity v. This is Coulomb
+        The result is n - mu t with t = v / sqrt(|v|² + v0²) for the tangential velocity v: Coulomb
         friction that fades below v0 = 1 mm/s.
         """
         tangential = self.sliding - (self.sliding @ self.normal) * self.normal
@@ -98,8 +98,8 @@ def contact_points(
     nearest = nearest_gap(gaps)
     problems: tuple[str, ...] = ()
     if abs(nearest) > CONTACT_POINT.max_gap:
-        word = "apart" if nearest > 0 else "overlapping"
-        problems = (f"condyles {word} by {abs(nearest) / MILLIMETRE:.1f} mm",)
+        state = "apart" if nearest > 0 else "overlapping"
+        problems = (f"condyles {state} by {abs(nearest) / MILLIMETRE:.1f} mm",)
     return ContactPoints(condyles, _find_lifted(condyles), problems)
 
 
@@ -116,10 +116,10 @@ def _find_lifted(condyles: dict[str, CondylePoint]) -> frozenset[str]:
     if len(condyles) < 2:
         return frozenset()
     medial, lateral = condyles["medial"], condyles["lateral"]
-    # z is medial-lateral: this is the distance of the contact points in the coronal plane.
+    # z is medial-lateral: the width is the distance of the contact points in the coronal plane.
     width = abs(lateral.point[2] - medial.point[2])
     higher = "lateral" if lateral.gap > medial.gap else "medial"
-    # The coronal angle is small: it is the difference of the gaps over that distance.
+    # The coronal angle is small: it is the difference of the gaps over the width.
     tilted = abs(lateral.gap - medial.gap) > CONTACT_POINT.lift_off_angle * width
     return frozenset(
         {higher} if tilted and condyles[higher].gap > CONTACT_POINT.lift_off_gap else ()

@@ -1,35 +1,35 @@
 """Muscles across the knee, other than the extensor group, in the equations of one frame.
 
-A taut line crosses from the shank at p to the thigh or pelvis at q. A force F pulls the shank at p
+A taut line runs from the shank at p to the thigh or pelvis at q. A force F pulls the shank at p
 along u = (q - p)/|q - p|, and the thigh at q along -u. Foot and shank are one body: a line that
 ends on the foot pulls this body at the point where the line leaves the foot. The force of a line
-from the pelvis is applied to the femur, and the hip loads balance it. Both ends are fixed to their
-links and move with them.
+from the pelvis acts on the femur, and the hip loads balance this force. Both ends are fixed to
+their links.
 
-The equations are linear in all loads while contact points and lines are fixed. This has two uses.
+With fixed contact points and lines the equations are linear in all loads. This has two uses.
 
 1. The tension of the extensor group is Q = Q_0 + sum_i g_i F_i + h r. Q_0 is the tension without
    the other muscles, F_i are the forces of the other muscles, and r is a moment on the tibia about
-   the insert's z. Solved for r this is the knee's row of a static optimisation (`flexion_row`),
+   the insert's z. Solved for r, the equation is the knee's row of a static optimisation
+   (`flexion_row`),
 
        -Q_0/h = -(1/h) Q + sum_i (g_i/h) F_i + r.
 
    The row includes contact, ligaments, patella and friction. -1/h is the moment arm of the extensor
    group, and -Q_0/h is the moment that all muscles together supply. If coordinates are released,
    contact points and the medial-lateral split depend on the muscles. The row then comes from the
-   tension of the patellar ligament. With the tangent of contact and ligaments this tension is
-   linear in the muscle forces (`ReleasedForces.tension_per_wrench`). A condyle that lifts off
-   changes that row smoothly.
+   tension of the patellar ligament, which the tangent of contact and ligaments makes linear in the
+   muscle forces (`ReleasedForces.tension_per_wrench`, `yielding_flexion_row`).
 
 2. A normal force is the sum of the contributions of all loads (`condyle_contributions`),
 
        N_side = N_side(weight, inertia and ground) + N_side(ligaments) + sum_i N_side(muscle i),
 
    plus N_side(post) if a cam on the insert's post is modelled. Each term is computed with all other
-   muscles and ligaments at zero force. One muscle alone leaves a flexion moment at the knee, which
-   a moment about the insert's z balances. As in every frame, residuals balance the AP and ML force
-   and the axial moment. The sum of the moments about z over all terms is the knee's reserve. The
-   extensor group is one muscle here.
+   muscles and ligaments at zero force. A moment about the insert's z balances the flexion moment of
+   each term. As in every frame, residuals balance the AP and ML force and the axial moment. The sum
+   of the moments about z over all terms is the knee's reserve. The extensor group is one muscle
+   here.
 
 References: Winby et al., J Biomech 42:2294 (2009), doi:10.1016/j.jbiomech.2009.06.019;
 Sasaki & Neptune, J Biomech 43:2780 (2010), doi:10.1016/j.jbiomech.2010.06.011.
@@ -71,47 +71,47 @@ class CrossingLines:
         """Return the rotation of the knee since the points were computed, rad; NaN: unknown.
 
         The end of a line that wraps a bone or passes a via point moves as the knee rotates. Here
-        the ends are fixed to their links. The error of a line's direction is at most about this
-        angle.
+        the ends are fixed to their links. The error of a line's direction is therefore at most
+        about this rotation.
         """
         if self.knee is None:
             return float("nan")
-        now = inverse(state.pose("tibia")) @ state.pose("femur")
-        change = Rotation.from_matrix(self.knee[:3, :3].T @ now[:3, :3])
+        pose = inverse(state.pose("tibia")) @ state.pose("femur")
+        change = Rotation.from_matrix(self.knee[:3, :3].T @ pose[:3, :3])
         return float(change.magnitude())
 
     def unit_wrenches(self, tibia: Array, femur: Array) -> Array:
-        """Return the wrenches (..., c, 6) of one newton of each line on the insert.
+        """Return the wrenches (..., c, 6) on the insert at a force of one newton in each line.
 
         Args:
             tibia: pose of the tibia link in the insert frame, shape (4, 4).
             femur: poses of the femur link in the insert frame, shape (..., 4, 4).
         """
         start = transform(tibia, self.shank)
-        along = np.einsum("...ij,cj->...ci", femur[..., :3, :3], self.thigh)
-        along = along + femur[..., None, :3, 3] - start
-        along = along / np.linalg.norm(along, axis=-1, keepdims=True)
-        return wrench_of(start, along)
+        directions = np.einsum("...ij,cj->...ci", femur[..., :3, :3], self.thigh)
+        directions = directions + femur[..., None, :3, 3] - start
+        directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+        return wrench_of(start, directions)
 
     def unit_loads(self, state: "ChainState") -> list[tuple[PointForces, ...]]:
-        """Return the loads of one newton of each line on tibia and femur, insert frame."""
+        """Return the loads on tibia and femur at one newton in each line, insert frame."""
         return [
             (PointForces("tibia", p[None], u[None]), PointForces("femur", q[None], -u[None]))
             for p, q, u in zip(*self._ends(state), strict=True)
         ]
 
     def loads(self, state: "ChainState", force: Array) -> tuple[PointForces, PointForces]:
-        """Return the loads of forces (c,), N, along the lines on tibia and femur, insert frame."""
-        start, end, along = self._ends(state)
-        pulls = force[:, None] * along
+        """Return the loads on tibia and femur at forces (c,), N, in the lines, insert frame."""
+        start, end, directions = self._ends(state)
+        pulls = force[:, None] * directions
         return PointForces("tibia", start, pulls), PointForces("femur", end, -pulls)
 
     def _ends(self, state: "ChainState") -> tuple[Array, Array, Array]:
         """Return the starts, ends and unit directions (c, 3) of the lines, insert frame."""
         start = transform(state.pose("tibia"), self.shank)
         end = transform(state.pose("femur"), self.thigh)
-        along = end - start
-        return start, end, along / np.linalg.norm(along, axis=-1, keepdims=True)
+        directions = end - start
+        return start, end, directions / np.linalg.norm(directions, axis=-1, keepdims=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,9 +124,9 @@ class MuscleShare:
         force: muscle forces, shape (m,), N.
         coordinates: names of the n balanced coordinates of the leg.
         moment: joint moments that muscles and reserves supply together, shape (n,), N·m.
-        reserve: part of the moments that no muscle supplies, shape (n,), N·m.
+        reserve: moments that no muscle supplies, a part of `moment`, shape (n,), N·m.
         flexion: index of the knee's flexion among the coordinates.
-        crossing: indices of the muscles across the knee, without the extensor group, shape (c,).
+        crossing: indices of the c muscles across the knee, without the extensor group, shape (c,).
         lines: lines of action of these c muscles.
         status: "ok" or "failed: …".
     """
@@ -144,8 +144,8 @@ class MuscleShare:
 
     def loads(self, state: "ChainState") -> tuple[PointForces, ...]:
         """Return the loads of the crossing muscles and the knee's reserve on tibia and femur."""
-        both = self.lines.loads(state, self.force[self.crossing])
-        return (*both, *unknowns.moment_pair("tibia", "femur", self._knee_reserve))
+        line_loads = self.lines.loads(state, self.force[self.crossing])
+        return (*line_loads, *unknowns.moment_pair("tibia", "femur", self._knee_reserve))
 
     def wrench(self, tibia: Array, femur: Array) -> Array:
         """Return the wrench (..., 6) of these loads on the insert, about its origin.
@@ -186,7 +186,7 @@ def flexion_row(
     """Return the knee's row of the static optimisation, with a taut extensor mechanism.
 
     Args:
-        geometry: the frame with an extensor mechanism; forces of other muscles are ignored.
+        geometry: the frame with an extensor mechanism; the forces of other muscles are not used.
         lines: lines of action of the muscles that cross the knee.
         friction: Coulomb coefficient of the femorotibial contact.
         lifted: sides that carry no load.
@@ -197,8 +197,8 @@ def flexion_row(
     if geometry.extensor is None:
         raise ComputationError("; ".join(geometry.problems) or "no patella", "muscles")
     # The forces of the other muscles are the unknowns of the row, so the equations exclude them.
-    alone = replace(geometry, share=None)
-    system = KneeSystem(alone, friction, LoadState(lifted, frozenset()))
+    without_muscles = replace(geometry, share=None)
+    system = KneeSystem(without_muscles, friction, LoadState(lifted, frozenset()))
     if not system.solution.regular:
         raise ComputationError("singular equations", "muscles")
     moment = unknowns.moment_pair("tibia", "femur", unknowns.AXES["ml"])
@@ -212,10 +212,10 @@ def flexion_row(
 def yielding_flexion_row(
     geometry: KneeGeometry, lines: CrossingLines, base: float, per_wrench: Array
 ) -> FlexionRow:
-    """Return the knee's row of the static optimisation if released coordinates move with muscles.
+    """Return the knee's row of the static optimisation if coordinates are released.
 
-    By the patella's equilibrium the extensor group's tension is Q = a T + b, where T is the tension
-    of the patellar ligament.
+    By the patella's equilibrium the tension of the extensor group is Q = a T + b, where T is the
+    tension of the patellar ligament.
 
     Args:
         geometry: the frame with an extensor mechanism; its contact is not used.
@@ -227,10 +227,10 @@ def yielding_flexion_row(
         ComputationError: the equations of the patella are singular.
     """
     state = geometry.state
-    ratio, free = _tension_by_ligament(geometry)
+    ratio, constant = _tension_by_ligament(geometry)
     gains = ratio * lines.unit_wrenches(state.pose("tibia"), state.pose("femur")) @ per_wrench
     slope = ratio * float(per_wrench[3:] @ unknowns.AXES["ml"])
-    return _solved_for_reserve(ratio * base + free, gains, slope)
+    return _solved_for_reserve(ratio * base + constant, gains, slope)
 
 
 def _tension_by_ligament(geometry: KneeGeometry) -> tuple[float, float]:
@@ -238,8 +238,10 @@ def _tension_by_ligament(geometry: KneeGeometry) -> tuple[float, float]:
     extensor, state = geometry.extensor, geometry.state
     assert extensor is not None
     femur_ml = state.pose("femur")[:3, 2]
-    pressed = unknowns.patellofemoral(extensor.contact_point, extensor.contact_normal, femur_ml)
-    unknown_forces = [geometry.muscles[0], *pressed]
+    contact_forces = unknowns.patellofemoral(
+        extensor.contact_point, extensor.contact_normal, femur_ml
+    )
+    unknown_forces = [geometry.muscles[0], *contact_forces]
     loads = [
         *(unknown.loads for unknown in unknown_forces),
         extensor.patellar_ligament,
@@ -248,20 +250,22 @@ def _tension_by_ligament(geometry: KneeGeometry) -> tuple[float, float]:
     columns = state.generalised(loads)[state.chain.patella_columns()]
     matrix, ligament, constants = columns[:, :3], columns[:, 3], columns[:, 4]
     names = [unknown.name for unknown in unknown_forces]
-    alone = unknowns.solve(names, matrix, state.inertial[state.chain.patella_columns()] - constants)
-    if not alone.regular:
+    solution = unknowns.solve(
+        names, matrix, state.inertial[state.chain.patella_columns()] - constants
+    )
+    if not solution.regular:
         raise ComputationError("singular equations", "muscles")
-    return -float(np.linalg.solve(matrix, ligament)[0]), alone.values[names[0]]
+    return -float(np.linalg.solve(matrix, ligament)[0]), solution.values[names[0]]
 
 
-def _solved_for_reserve(alone: float, gains: Array, slope: float) -> FlexionRow:
+def _solved_for_reserve(constant: float, gains: Array, slope: float) -> FlexionRow:
     """Return the row from Q = alone + gains F + slope r, solved for the reserve r."""
-    return FlexionRow(-alone / slope, -1.0 / slope, np.asarray(gains / slope))
+    return FlexionRow(-constant / slope, -1.0 / slope, np.asarray(gains / slope))
 
 
 EXTERNAL, LIGAMENTS, POST, EXTENSORS = "external", "ligaments", "post", "quadriceps"
-"""Names of contributions other than single muscles. "external": weight, inertia and ground
-reaction. "ligaments": all ligaments. "post": a cam on the post. "quadriceps": extensor group."""
+"""Names of the contributions of weight, inertia and ground reaction; of all ligaments; of a cam on
+the post; and of the extensor group."""
 
 
 def condyle_contributions(
@@ -280,27 +284,29 @@ def condyle_contributions(
     if share is None or extensor is None or loads.problems:
         return {}
     slack = frozenset(extensor.muscles) if loads.slack else frozenset[str]()
-    # If all known loads are zero, the solution is the contribution of weight, inertia and ground.
-    bare = replace(geometry, share=None, ligaments=(), post=())
-    system = KneeSystem(bare, friction, LoadState(loads.lifted, slack))
+    # Without the other loads, the solution is the contribution of weight, inertia and ground.
+    without_known_loads = replace(geometry, share=None, ligaments=(), post=())
+    system = KneeSystem(without_known_loads, friction, LoadState(loads.lifted, slack))
     lines = share.lines.unit_loads(geometry.state)
     moment = unknowns.moment_pair("tibia", "femur", unknowns.AXES["ml"])
     constants = {LIGAMENTS: geometry.ligaments} | ({POST: geometry.post} if geometry.post else {})
     unit = system.response(geometry.state.generalised([*constants.values(), *lines, moment]))
-    outside = np.array([system.solution.values[name] for name in system.names])
+    external = np.array([system.solution.values[name] for name in system.names])
     force = share.force[share.crossing]
-    pulls = np.concatenate([np.ones(len(constants)), force])
-    caused = np.column_stack([outside, unit[:, :-1] * pulls])
-    pulled = np.zeros(len(outside))
+    magnitudes = np.concatenate([np.ones(len(constants)), force])
+    contributions = np.column_stack([external, unit[:, :-1] * magnitudes])
+    from_extensors = np.zeros(len(external))
     if not slack:
         # The extensor group is a known load here. A flexion moment replaces it as unknown.
         row = system.names.index(unknowns.muscle_load(extensor.muscles[0]))
-        per_newton = unit[:, -1] / unit[row, -1]
-        caused = caused - np.outer(per_newton, caused[row])
-        pulled = per_newton * extensor.tension(loads.values)
+        per_extensor_newton = unit[:, -1] / unit[row, -1]
+        contributions = contributions - np.outer(per_extensor_newton, contributions[row])
+        from_extensors = per_extensor_newton * extensor.tension(loads.values)
     names = [EXTERNAL, *constants, *(share.muscles[i] for i in share.crossing), EXTENSORS]
-    caused = np.column_stack([caused, pulled])
+    contributions = np.column_stack([contributions, from_extensors])
     return {
-        side: dict(zip(names, caused[system.names.index(f"{side}_normal")].tolist(), strict=True))
+        side: dict(
+            zip(names, contributions[system.names.index(f"{side}_normal")].tolist(), strict=True)
+        )
         for side in system.carrying
     }

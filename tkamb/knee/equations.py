@@ -1,4 +1,4 @@
-"""The equations of one frame of the knee: they give all unknown loads from a known geometry.
+"""The equations of one frame of the knee, which give all unknown loads from a known geometry.
 
 The full model has 15 equations (6 of the free root, 6 of the knee, 3 of the patella) and 15
 unknowns: hip force and moment (6), one muscle, patellar ligament, patellofemoral force (2), medial
@@ -36,10 +36,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class EquationSettings:
-    """The equations of motion of the leg."""
+    """Sensitivity of the loads to the residuals."""
 
     residual_shift: float = 0.010
-    """m: shift along y of the point where the residuals act. It defines the column
+    """m: shift along y of the point where the residuals act, for the column
     `residual_sensitivity_N`."""
 
 
@@ -58,7 +58,7 @@ class Extensor:
         contact_point: point of patellofemoral contact, shape (3,), m.
         contact_normal: unit normal from femur to patella, in the sagittal plane, shape (3,).
         muscles: names of the extensor group, the muscles that insert on the patella.
-        wrap: angle over which the extensor group wraps the femur, rad.
+        wrap: angle by which the extensor group wraps the femur, rad.
     """
 
     patellar_ligament: tuple[PointForces, ...]
@@ -140,28 +140,27 @@ def solve_knee(geometry: KneeGeometry, friction: float) -> SolvedLoads:
     """Return all loads of one frame, in the load state without a wrong sign.
 
     If several states have no wrong sign, the state with the fewest zero loads is used, and
-    `ambiguous` is true. If every state has a wrong sign, there is no solution. See
-    `tkamb.knee.unknowns`.
+    `ambiguous` is true. If every state has a wrong sign, there is no solution.
 
     Args:
         geometry: the frame.
         friction: Coulomb coefficient of the femorotibial contact.
     """
-    off = geometry.lifted
+    lifted = geometry.lifted
     extensors = geometry.extensor.muscles if geometry.extensor else ()
-    first, *others = load_states(geometry.condyles, off, extensors)
-    # The state in which all loads act is solved first. Most frames need no other state.
+    first, *others = load_states(geometry.condyles, lifted, extensors)
+    # Most frames need only the state in which all loads act.
     full = KneeSystem(geometry, friction, first)
     condition = full.solution.condition
     if not full.solution.regular:
         return replace(unsolved(("singular equations",)), condition=condition)
     if not wrong_signs(first, full.solution):
         return full.loads()
-    # A contact cannot pull and a muscle cannot push: they carry no load instead. All combinations
-    # are solved, and a combination without a wrong sign is used.
+    # A contact that would pull or a muscle that would push carries no load. All load states are
+    # solved, and a state without a wrong sign is used.
     systems = {first: full} | {state: KneeSystem(geometry, friction, state) for state in others}
     solutions = {state: system.solution for state, system in systems.items()}
-    wrong = {state: contradictions(state, solutions, off) for state in systems}
+    wrong = {state: contradictions(state, solutions, lifted) for state in systems}
     admissible = [system for state, system in systems.items() if not wrong[state]]
     if not admissible:
         reasons = ", ".join(f"{state.label}: {wrong[state][0]}" for state in systems)
@@ -199,15 +198,13 @@ def dome_sensitivity(
     The patellofemoral force passes through the contact of the button with the femur. The moment
     arms about this line of action decide the ratio of muscle and patellar-ligament tension. A
     button that is higher or lower on the patella (y axis) shifts the line sideways and changes the
-    arms. A deeper button (x axis) shifts the line along itself and changes little. The position of
-    the button is not known to a millimetre.
+    arms. The position of the button is known to about a millimetre only.
 
-    Here the line is shifted along the patella's y axis and the patella does not move. If A x = b
-    are the frame's equations, dx = -A⁻¹ dA x. On the shipped knee, from extension to 120 deg, the
-    quadriceps changes by 1.6 to 5.6 % per millimetre, and the patellofemoral force by 1.0 to 4.3 %.
-    A patella that moves to its new equilibrium rotates by up to 1 deg per millimetre and cancels
-    most of this change: the quadriceps then changes by 1.6 % at most. The value for the quadriceps
-    is therefore an upper estimate.
+    Here the line is shifted along the patella's y axis, and the patella does not move. With the
+    frame's equations A x = b the change is dx = -A⁻¹ dA x. On the shipped knee, from extension to
+    120 deg, the tension of the quadriceps changes by 1.6 to 5.6 % per millimetre, and the
+    patellofemoral force by 1.0 to 4.3 %. If the patella rotated to its new equilibrium, the tension
+    would change by 1.6 % at most. The value for the quadriceps is therefore an upper estimate.
 
     Args:
         geometry: the frame.
@@ -223,16 +220,18 @@ def dome_sensitivity(
         return None
     if loads.slack:
         return 0.0, 0.0
-    bare = replace(geometry, share=None, ligaments=(), post=())  # known loads do not change
-    system = KneeSystem(bare, friction, LoadState(loads.lifted, frozenset()))
-    femur_ml, up = state.pose("femur")[:3, 2], state.pose("patella")[:3, 1]
+    without_known_loads = replace(
+        geometry, share=None, ligaments=(), post=()
+    )  # known loads do not change
+    system = KneeSystem(without_known_loads, friction, LoadState(loads.lifted, frozenset()))
+    femur_ml, patella_axis = state.pose("femur")[:3, 2], state.pose("patella")[:3, 1]
     at_contact = unknowns.patellofemoral(extensor.contact_point, extensor.contact_normal, femur_ml)
-    turns = [
-        unknowns.moment_pair("patella", "femur", cross(up, unknown.loads[0].forces[0]))
+    couples = [
+        unknowns.moment_pair("patella", "femur", cross(patella_axis, unknown.loads[0].forces[0]))
         for unknown in at_contact
     ]
     magnitudes = np.array([loads.values[unknown.name] for unknown in at_contact])
-    changes = system.response((state.generalised(turns) @ magnitudes)[:, None])[:, 0]
+    changes = system.response((state.generalised(couples) @ magnitudes)[:, None])[:, 0]
     slopes = dict(zip(system.names, changes.tolist(), strict=True))
     return extensor.tension(slopes), slopes["patellofemoral"]
 
@@ -243,7 +242,7 @@ class KneeSystem:
     Args:
         geometry: the frame.
         friction: Coulomb coefficient.
-        assumed: load state: the loads that are assumed to be zero.
+        assumed: the loads that are assumed to be zero.
     """
 
     def __init__(self, geometry: KneeGeometry, friction: float, assumed: LoadState) -> None:
@@ -257,11 +256,11 @@ class KneeSystem:
         # `sensitivity` shifts the residual forces along y by these unit couples about x and z.
         couples = [unknowns.moment_pair("tibia", "femur", unknowns.AXES[a]) for a in ("ap", "ml")]
         pulls = geometry.share.loads(state) if geometry.share else ()
-        given_loads = (*geometry.ligaments, *geometry.post, *pulls)
-        groups = [*(unknown.loads for unknown in unknown_forces), *couples, ground, given_loads]
+        known_loads = (*geometry.ligaments, *geometry.post, *pulls)
+        groups = [*(unknown.loads for unknown in unknown_forces), *couples, ground, known_loads]
         columns = state.generalised(groups)
         self._columns, self._couples = columns[:, :-4], columns[:, -4:-2]
-        # Generalised forces that hip and knee supply together: inertia less the ground reaction.
+        # Generalised forces of hip and knee together: inertial forces less the ground reaction.
         self._outside = state.inertial - columns[:, -2]
         # Known loads of the knee (ligaments, post, muscles) are subtracted, too.
         self._right = self._outside - columns[:, -1]
@@ -305,9 +304,10 @@ class KneeSystem:
         return np.asarray(-np.linalg.solve(self._columns, loads))
 
     def sensitivity(self) -> float:
-        """Return the largest change (N) of the total force as the residuals shift along y.
+        """Return the largest change (N) of the total force if the residuals shift along y.
 
-        A shift s along y adds the couples s y x (x, z) = s (-z, x) to the residual forces.
+        A shift s along y adds the couple -s about z to a unit force along x, and the couple s
+        about x to a unit force along z.
         """
         if not self.geometry.condyles:
             return 0.0
@@ -332,8 +332,8 @@ class KneeSystem:
         meet at the femoral origin, the centre of the knee.
         """
         hip = self._columns[:, :6]
-        # The knee's internal loads cancel in the six equations of the free root. These equations
-        # therefore give the hip's six unknowns.
+        # The internal loads of the knee cancel in the six equations of the free root, so these
+        # equations give the six unknowns of the hip.
         at_hip = np.linalg.solve(hip[:6], self._outside[:6])
         knee = self._outside - hip @ at_hip
         rows = self.geometry.state.chain.knee_columns()

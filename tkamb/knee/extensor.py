@@ -1,4 +1,4 @@
-"""The extensor mechanism: its lines of action, and the patella over the frames of a motion."""
+"""The extensor mechanism: its lines of action, and the patella in all frames of a motion."""
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
@@ -37,7 +37,7 @@ class ExtensorParts:
         chain: chain of the knee.
         femoral: surface of the femoral component, in the femur link's frame.
         button: surface of the patellar button, in the patella link's frame.
-        insert: surface of the insert, in the insert frame; None: the ligament does not wrap.
+        insert: surface of the insert, in the insert frame; None: the ligament is straight.
     """
 
     muscle: Muscle
@@ -65,7 +65,7 @@ class ExtensorLines:
         muscle: line of action of the muscle.
         ligament: line of action of the patellar ligament.
         mechanism: input of the search for the patella.
-        prepared: the patellofemoral contact, shared by all objects with the same surfaces.
+        prepared: the patellofemoral contact; objects with the same surfaces share it.
 
     Raises:
         InputError: a line starts inside the bone that it wraps.
@@ -91,8 +91,8 @@ class ExtensorLines:
         Args:
             pose: pose_femur_in_insert, shape (4, 4).
             guess: the patella at a similar pose, as initial guess.
-            near: coordinates as initial guess if `guess` is None, shape (3,), m and rad; None: all
-                rotations are searched.
+            near: coordinates as initial guess if `guess` is None, shape (3,), m and rad; None: the
+                search covers all rotations.
         """
         if guess is None or not guess.status.found:
             return solve_patella(self.mechanism, pose, near)
@@ -147,7 +147,8 @@ class ExtensorLines:
                 equilibrium.
 
         Raises:
-            ComputationError: the patella has no equilibrium with forces of the right signs.
+            ComputationError: the patella was not found, or its equilibrium has a force of the wrong
+                sign.
         """
         extensor, muscle = self.loads(flexion, _Poses(poses), patella)
         pulls = scaled(muscle.loads, tension)
@@ -200,14 +201,16 @@ class ExtensorLines:
         return inverse(self._chain.insert_in_tibia) @ on_tibia
 
     def _check_fixed_ends(self) -> None:
-        """Raise an error if an end that is fixed to the wrapped bone lies inside its outline."""
+        """Raise an error if a fixed end of a line lies inside the outline that the line wraps."""
         ends, name = [], self.muscle.name
         if self.muscle.wrap is not None:
-            last = self.muscle.points[self.muscle.wrap.stretch]
-            place = transform(self._chain.link_in(last.link, "femur"), last.position)
+            last = self.muscle.points[self.muscle.wrap.segment]
+            origin = transform(self._chain.link_in(last.link, "femur"), last.position)
             low, high = self._parts.femoral.bounds[:, 2]
-            whole = sagittal_outline([self._parts.femoral], 0.95 * np.linspace(low, high, 15))
-            ends.append((f"the origin of {name}", place, whole, "femur"))
+            femoral_outline = sagittal_outline(
+                [self._parts.femoral], 0.95 * np.linspace(low, high, 15)
+            )
+            ends.append((f"the origin of {name}", origin, femoral_outline, "femur"))
         if self.ligament.wrap is not None:
             tuberosity = transform(self._tibia_in_insert(), self.ligament.points[1].position)
             outline = self.ligament.wrap.outline
@@ -223,8 +226,8 @@ class ExtensorLines:
     def _build_mechanism(self) -> tuple[ExtensorMechanism, PatellofemoralContact]:
         """Return the mechanism, and its prepared contact."""
         parts, chain = self._parts, self._chain
-        stretch = off_femur(self.muscle.points, chain)
-        origin, insertion = self.muscle.points[stretch : stretch + 2]
+        segment = off_femur(self.muscle.points, chain)
+        origin, insertion = self.muscle.points[segment : segment + 2]
         joint, (proximal, distal) = chain.patella_joint_in_femur, self.ligament.points
         prepared = _patellar_contact(parts.femoral, parts.button, joint.tobytes())
         mechanism = ExtensorMechanism(
@@ -278,7 +281,7 @@ class ExtensorFrames:
     def moved(self, lines: ExtensorLines, poses: Array, frames: Sequence[int]) -> "ExtensorFrames":
         """Return a solved patella for slightly changed lines or poses of the femur.
 
-        In the given frames the patella is solved again, with its present position as initial guess.
+        In the given frames the patella is solved again, with its last position as initial guess.
         The rates and all other frames do not change.
 
         Args:
@@ -290,10 +293,10 @@ class ExtensorFrames:
         other.lines = lines
         states, other._joints = list(self.states), self._joints.copy()
         for k in frames:
-            near = self.states[k]
-            solution = solve_patella(lines.mechanism, poses[k], near.coordinates, near.slopes)
+            state = self.states[k]
+            solution = solve_patella(lines.mechanism, poses[k], state.coordinates, state.slopes)
             states[k] = solution
-            other._joints[k, 0] += solution.coordinates - near.coordinates
+            other._joints[k, 0] += solution.coordinates - state.coordinates
         other.states = states
         return other
 
@@ -302,29 +305,29 @@ class ExtensorFrames:
         return np.asarray(self._joints[k])
 
     def at(self, k: int) -> "PatellaOfFrame":
-        """Return the object that finds the patella of frame k."""
+        """Return the patella finder of frame k."""
         return PatellaOfFrame(self, k)
 
     def patella(self, k: int, pose: Array, guess: PatellaState | None = None) -> PatellaState:
         """Return the patella of frame k with the femur at another pose (4, 4).
 
-        A recorded patella keeps its coordinates. A solved patella is solved again. The initial
+        A recorded patella keeps its coordinates. A solved patella is solved again; the initial
         guess is `guess` or the patella at the recorded pose.
         """
         mechanism = self.lines.mechanism
         if self._contacts is not None:
-            return patella_at(mechanism, pose, self._contacts.places[k], self._contacts[k])
-        own = self.states[k]
-        if guess is not None and own.status.found:
-            # If the search from a distant guess fails, the search from the frame's own solution
-            # may converge.
-            near = guess.coordinates
-            solution = solve_patella(mechanism, pose, near, guess.slopes, anywhere=False)
+            return patella_at(mechanism, pose, self._contacts.coordinates[k], self._contacts[k])
+        frame_state = self.states[k]
+        if guess is not None and frame_state.status.found:
+            # If the search from a distant guess fails, the search from the solution at the recorded
+            # pose may converge.
+            coordinates = guess.coordinates
+            solution = solve_patella(mechanism, pose, coordinates, guess.slopes, anywhere=False)
             if solution.status.found:
                 return solution
             guess = None
-        last = own if guess is None else guess
-        return solve_patella(mechanism, pose, last.coordinates, last.slopes)
+        initial_state = frame_state if guess is None else guess
+        return solve_patella(mechanism, pose, initial_state.coordinates, initial_state.slopes)
 
     def _differentiate(self, time: Array, poses: Array, rates: Rates) -> Array:
         """Return the solved coordinates with their rates (f, 3, 3); NaN: the patella is lost.
@@ -332,33 +335,36 @@ class ExtensorFrames:
         Only rates and accelerations are filtered. At filtered coordinates the button would not
         touch the femur and the moments would not balance.
 
-        The rates next to a lost frame need coordinates in that frame: a shape-preserving cubic
-        interpolates them. An error of 1 m/s² changes the force on a patella of 0.1 kg by 0.1 N.
+        The filter needs coordinates in lost frames: a shape-preserving cubic interpolates them. An
+        error of 1 m/s² changes the inertial force of a patella of 0.1 kg by 0.1 N.
         """
-        places = np.array([state.coordinates for state in self.states])
-        solved_frames = np.flatnonzero(np.isfinite(places).all(axis=1))
+        coordinates = np.array([state.coordinates for state in self.states])
+        solved_frames = np.flatnonzero(np.isfinite(coordinates).all(axis=1))
         if len(solved_frames) < 2:
             flexion = knee_coordinates(poses)[:, KNEE_COORDINATES.index("flexion")] / DEGREE
             raise InputError(
-                f"no place of the patella is found in {len(places) - len(solved_frames)} of "
-                f"{len(places)} frames; first: {self.states[0].status.value}",
+                f"the patella is not found in {len(coordinates) - len(solved_frames)} of "
+                f"{len(coordinates)} frames; first: {self.states[0].status.value}",
                 "[patella]",
-                "check its mesh, the lines' points, length_mm, and the motion's angle_unit: "
+                "check the button's mesh, the points of the lines, length_mm, and angle_unit of "
+                "[motion]: "
                 f"flexion is read as {flexion.min():.3g} to {flexion.max():.3g} deg",
             )
-        part = slice(solved_frames[0], solved_frames[-1] + 1)
-        bridged = PchipInterpolator(time[solved_frames], places[solved_frames])(time[part])
-        _, velocity, acceleration = rates(time[part], bridged)
-        result = np.full((len(places), 3, 3), np.nan)
-        result[part, 1], result[part, 2] = velocity, acceleration
-        result[:, 0] = places
-        result[np.isnan(places).any(axis=1)] = np.nan
+        span = slice(solved_frames[0], solved_frames[-1] + 1)
+        interpolated = PchipInterpolator(time[solved_frames], coordinates[solved_frames])(
+            time[span]
+        )
+        _, velocity, acceleration = rates(time[span], interpolated)
+        result = np.full((len(coordinates), 3, 3), np.nan)
+        result[span, 1], result[span, 2] = velocity, acceleration
+        result[:, 0] = coordinates
+        result[np.isnan(coordinates).any(axis=1)] = np.nan
         return result
 
 
 @dataclass(frozen=True, eq=False)
 class PatellaOfFrame:
-    """Finds the patella of one frame of a motion.
+    """Finds the patella in one frame of a motion.
 
     Args:
         frames: the patella over all frames.
@@ -384,9 +390,11 @@ class PatellaOfFrame:
 def _patellar_contact(femoral: Surface, button: Surface, joint: bytes) -> PatellofemoralContact:
     """Return the prepared contact of two surfaces, cached for the many samples of a scene.
 
+    The cache compares the identity of the surfaces.
+
     Args:
-        femoral: femoral component, femur link's frame; the cache compares its identity.
-        button: patellar button, patella link's frame; the cache compares its identity.
+        femoral: femoral component, femur link's frame.
+        button: patellar button, patella link's frame.
         joint: bytes of pose_joint_in_femur (4, 4).
     """
     joint_in_femur = np.frombuffer(joint).reshape(4, 4)
@@ -398,25 +406,27 @@ class _RecordedContacts:
 
     Args:
         contact: contact of the two surfaces, without stored distances.
-        places: recorded coordinates of the patella, shape (f, 3), m and rad.
+        coordinates: recorded coordinates of the patella, shape (f, 3), m and rad.
     """
 
-    def __init__(self, contact: PatellofemoralContact, places: Array) -> None:
-        self.places, self._contact = places, contact
-        self._found: dict[int, PatellarContact] = {}
+    def __init__(self, contact: PatellofemoralContact, coordinates: Array) -> None:
+        self.coordinates, self._contact = coordinates, contact
+        self._cache: dict[int, PatellarContact] = {}
 
     def __getitem__(self, k: int) -> PatellarContact:
-        if k not in self._found:
-            self._found[k] = self._contact.at(self.places[k])
-        return self._found[k]
+        if k not in self._cache:
+            self._cache[k] = self._contact.at(self.coordinates[k])
+        return self._cache[k]
 
 
 @lru_cache(maxsize=1)
 def _recorded_contacts(prepared: PatellofemoralContact, coordinates: bytes) -> _RecordedContacts:
     """Return the contacts at recorded coordinates. They do not depend on the knee's pose.
 
+    The cache compares the identity of the prepared contact.
+
     Args:
-        prepared: the prepared contact; the cache compares its identity.
+        prepared: the prepared contact.
         coordinates: bytes of the coordinates (f, 3), m and rad.
     """
     return _RecordedContacts(prepared.unused(), np.frombuffer(coordinates).reshape(-1, 3))
@@ -429,7 +439,7 @@ class _RecordedStates(Sequence[PatellaState]):
         self, mechanism: ExtensorMechanism, poses: Array, contacts: _RecordedContacts
     ) -> None:
         self._mechanism, self._poses, self._contacts = mechanism, poses, contacts
-        self._found: dict[int, PatellaState] = {}
+        self._cache: dict[int, PatellaState] = {}
 
     def __len__(self) -> int:
         return len(self._poses)
@@ -442,18 +452,18 @@ class _RecordedStates(Sequence[PatellaState]):
         if isinstance(k, slice):
             return [self[one] for one in range(len(self))[k]]
         k = range(len(self))[k]
-        if k not in self._found:
-            place, contact = self._contacts.places[k], self._contacts[k]
-            self._found[k] = patella_at(self._mechanism, self._poses[k], place, contact)
-        return self._found[k]
+        if k not in self._cache:
+            coordinates, contact = self._contacts.coordinates[k], self._contacts[k]
+            self._cache[k] = patella_at(self._mechanism, self._poses[k], coordinates, contact)
+        return self._cache[k]
 
 
 def _solve_all(mechanism: ExtensorMechanism, poses: Array) -> list[PatellaState]:
     """Return the patella at each frame, with the previous frame as initial guess."""
     states: list[PatellaState] = []
     for pose in poses:
-        near = (states[-1].coordinates, states[-1].slopes) if states else ()
-        states.append(solve_patella(mechanism, pose, *near))
+        initial_guess = (states[-1].coordinates, states[-1].slopes) if states else ()
+        states.append(solve_patella(mechanism, pose, *initial_guess))
     return states
 
 

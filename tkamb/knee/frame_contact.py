@@ -1,4 +1,4 @@
-"""The contact of one frame in a run: both condyles, and cam and post."""
+"""The contact of one frame in a run: condyles, cam and post."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -48,10 +48,10 @@ def cam_on_post(
         pair: femoral component and insert.
         post: surface of the insert's post, insert frame.
         material: material of the insert.
-        ready: an earlier result, perhaps with another material; None: no earlier result.
+        ready: an earlier result, also with another material; None: no earlier result.
 
     Raises:
-        InputError: the errors of `CamPost`.
+        InputError: see `CamPost`.
     """
     if ready is not None:
         return ready if ready.material == material else ready.of_material(material)
@@ -70,13 +70,14 @@ def post_contact(
     if cam_post is None:
         return None
     post = cam_post.at(pose)
+    # With AP released, equilibrium determines the overlap.
     if "ap" in released or post.problem or not post.gap < -POST_SIDE.pose_error:
         return post
-    question = (
-        f"cam and post overlap by {-post.gap / MILLIMETRE:.1f} mm as recorded, which makes "
-        f"{np.linalg.norm(post.force):.0f} N: release ap"
+    flag = (
+        f"cam and post: they overlap by {-post.gap / MILLIMETRE:.1f} mm at the recorded position, "
+        f"with a force of {np.linalg.norm(post.force):.0f} N: add 'ap' to [contact] released"
     )
-    return replace(post, flags=(*post.flags, question))
+    return replace(post, flags=(*post.flags, flag))
 
 
 NAN = float("nan")
@@ -97,8 +98,8 @@ class FrameContact:
         load_change: change of the load in the last iteration, N.
         point_change: change of the centres of pressure in the last iteration, m.
         equilibrium: result of the search for released coordinates; None: none are released.
-        sensitivity: change of the medial force with adduction (`split_sensitivity`), N/rad; NaN if
-            adduction is released, or with one condyle.
+        sensitivity: change of the medial force with adduction (`split_sensitivity`), N/rad; NaN:
+            adduction is released, or there is one condyle.
         start: warm start of the next frame; None: there is no result.
         triangles: triangles of the map, shape (k, 3).
         post: contact of cam and post; None: not modelled.
@@ -129,7 +130,7 @@ class FrameContact:
         condyle = self.result.medial if side == "medial" else self.result.lateral
         if condyle is None:
             return NAN
-        own = self.medial if side == "medial" else ~self.medial
-        own_pressure = np.where(own, self.result.pressure, 0.0)
-        above = area_above(self.result.points, self.triangles, own_pressure, pressure)
+        under_condyle = self.medial if side == "medial" else ~self.medial
+        condyle_pressure = np.where(under_condyle, self.result.pressure, 0.0)
+        above = area_above(self.result.points, self.triangles, condyle_pressure, pressure)
         return min(above / condyle.area, 1.0)

@@ -1,7 +1,7 @@
 """A knee at one instant: its geometry and loads, at the pose of q or at other knee coordinates.
 
 The motion of the shank depends on q, v and a alone. The wrench that the knee must exert on the
-shank is therefore computed once for all knee coordinates of a search.
+shank is therefore computed only once in a search over knee coordinates.
 """
 
 from collections.abc import Mapping
@@ -52,7 +52,7 @@ class SharingMuscles(Protocol):
     def share_of_yielding_knee(
         self, geometry: KneeGeometry, base: float, per_wrench: Array
     ) -> "MuscleShare":
-        """Return the force of each muscle if the released coordinates depend on these forces."""
+        """Return the force of each muscle; the released coordinates depend on these forces."""
 
     def at(self, share: "MuscleShare") -> "MuscleShare":
         """Return the forces of a share with the lines of action of this instant."""
@@ -99,7 +99,7 @@ class Instant:
     Args:
         chain: the canonical chain.
         motion: motion of the chain.
-        shank: wrench for the inertia and weight of the shank, shape (6,), insert frame.
+        shank: wrench that inertia and weight of the shank require, shape (6,), insert frame.
         thigh: external wrench on the thigh, shape (6,), insert frame.
         on_patella: external wrench on the patella, shape (6,), insert frame.
         ligaments: ligament bundles, with ends on links of the chain.
@@ -141,16 +141,18 @@ class Instant:
             coordinates: knee coordinates, shape (6,), m and rad; None: those of q.
             patella: the patella; None: `extensor` finds it.
         """
-        place = self.coordinates if coordinates is None else coordinates
+        knee_coordinates = self.coordinates if coordinates is None else coordinates
         motion = self.motion
         problems: tuple[str, ...] = ()
         if self.extensor is not None and patella is None:
             try:
-                patella = self.extensor.patella(None if coordinates is None else knee_pose(place))
+                patella = self.extensor.patella(
+                    None if coordinates is None else knee_pose(knee_coordinates)
+                )
             except ComputationError as error:
                 problems = (str(error),)
         joints = motion.joints.copy()
-        joints[0, :6] = place
+        joints[0, :6] = knee_coordinates
         if patella is not None and patella.status.found:
             joints[0, 6:] = patella.coordinates
         state = canonical_state(
@@ -158,12 +160,17 @@ class Instant:
         )
         tensions, pulls = self._pulls(state)
         geometry = KneeGeometry(
-            state, self.ground, pulls, coordinates=place, tensions=tensions, problems=problems
+            state,
+            self.ground,
+            pulls,
+            coordinates=knee_coordinates,
+            tensions=tensions,
+            problems=problems,
         )
         if self.extensor is None or patella is None:
             return geometry
         try:
-            extensor, muscle = self.extensor.lines.loads(place[5], state, patella)
+            extensor, muscle = self.extensor.lines.loads(knee_coordinates[5], state, patella)
         except ComputationError as error:
             return replace(geometry, problems=(str(error),))
         return replace(geometry, extensor=extensor, muscles=(muscle,))
@@ -174,7 +181,7 @@ class Instant:
             return {}, ()
         from tkamb.knee.ligaments import ligament_loads
 
-        links = {end.link for one in self.ligaments for end in (one.proximal, one.distal)}
+        links = {end.link for bundle in self.ligaments for end in (bundle.proximal, bundle.distal)}
         tensions, loads = ligament_loads(self.ligaments, {link: state.pose(link) for link in links})
         names = [bundle.name for bundle in self.ligaments]
         return dict(zip(names, tensions.tolist(), strict=True)), loads
@@ -238,13 +245,14 @@ class Instant:
             condyles: loaded side -> its load on the insert at these coordinates.
             points: side -> point (3,), m, where an unloaded condyle is nearest to the insert.
         """
-        up, still = np.array([0.0, 1.0, 0.0]), np.zeros(3)
-        separated = {
-            side: CondylePoint(point, up, still, float("nan")) for side, point in points.items()
+        vertical, zero = np.array([0.0, 1.0, 0.0]), np.zeros(3)
+        unloaded = {
+            side: CondylePoint(point, vertical, zero, float("nan"))
+            for side, point in points.items()
         }
         resultants = self.resultants(coordinates, condyles)
         lifted = frozenset(self.sides - set(resultants))
-        return replace(geometry, condyles=separated | resultants, lifted=lifted)
+        return replace(geometry, condyles=unloaded | resultants, lifted=lifted)
 
     def post_loads(
         self, coordinates: Array, post: "CondyleWrench | None"
@@ -258,11 +266,11 @@ class Instant:
         if post is None:
             return ()
         sliding = self.sliding(coordinates, post.point)
-        touch = CondylePoint(post.point, post.normal, sliding, 0.0)
-        force = -post.force * touch.direction(self.friction)
-        # Couple of the cam's pressure about its centre.
-        twist = post.wrench[3:] - cross(post.point, post.wrench[:3])
+        contact_point = CondylePoint(post.point, post.normal, sliding, 0.0)
+        force = -post.force * contact_point.direction(self.friction)
+        # Couple of the cam's pressure about `post.point`.
+        couple = post.wrench[3:] - cross(post.point, post.wrench[:3])
         return (
-            PointForces("tibia", post.point[None], force[None], twist),
-            PointForces("femur", post.point[None], -force[None], -twist),
+            PointForces("tibia", post.point[None], force[None], couple),
+            PointForces("femur", post.point[None], -force[None], -couple),
         )

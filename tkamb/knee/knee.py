@@ -4,8 +4,7 @@
     tau = pin.rnea(model, data, q, v, a, knee.external_forces(q, v))
 
 All units are SI. Arguments and results are NumPy arrays and Pinocchio types. A call reads no files,
-prints nothing, and does not change the result of the next call. To save time, a caller creates a
-`KneeData` and passes it to each call.
+prints nothing, and does not change the result of the next call.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,7 +22,7 @@ from tkamb.geometry.frames import (
     knee_pose,
 )
 from tkamb.knee.assembled import PATELLAR_LIGAMENT, AssembledKnee, KneeData
-from tkamb.knee.canonical import KneePlace, mirrored_spatial, summed
+from tkamb.knee.canonical import KneePose, mirrored_spatial, summed
 from tkamb.knee.contact_points import NO_CONTACT
 from tkamb.knee.equations import KneeGeometry
 from tkamb.knee.instant import Instant, PatellaAt, PatellaFinder, SharingMuscles
@@ -45,11 +44,11 @@ class Equilibrium:
         coordinates: knee coordinates in equilibrium, shape (6,), m and rad. The coordinates of a
             left knee are those of its mirror image.
         loads: loads of the knee in equilibrium.
-        contact: the contact in equilibrium; None: no equilibrium was found.
+        contact: the contact in equilibrium; None: no equilibrium.
         residual: largest residual force on a released coordinate, N (moments divided by 25 mm).
         stiffness: stiffness of the n released coordinates, shape (n, n), N/m (rotations times
             25 mm).
-        problem: reason why no equilibrium was found; empty: it was found.
+        problem: reason why there is no equilibrium; empty: there is an equilibrium.
         search: details of the search.
     """
 
@@ -68,9 +67,10 @@ class Knee(AssembledKnee):
 
     The knee lies between the frames "femur" and "tibia" of the model. The model may have any joints
     between, above and below these frames. Frames of the model give the poses of the knee's parts.
-    The argument `frames` names a frame if its name differs from that of the part:
+    If a frame has another name than its part, name it in the argument `frames`. The parts are:
 
-    - `femur`, `tibia`: required. Attachment points may lie on any frame that is fixed to them.
+    - `femur`, `tibia`: required. Attachment points may lie on any frame that is fixed to one of
+      them.
     - `femoral`: axes of the femoral component's mesh, fixed to the femur. Default: `femur`.
     - `insert`: axes of the insert's mesh, fixed to the tibia. Default: the placement of a joint
       "knee_ap" on the tibia, or `tibia`.
@@ -116,7 +116,7 @@ class Knee(AssembledKnee):
             tensions: muscle -> tension, N; or the tension of the quadriceps alone, N. Muscles
                 without a tension are slack. If "patellar_ligament" is given with the quadriceps, as
                 in `KneeLoads.tensions`, the patellofemoral force balances these two tensions.
-            data: data from `create_data`; they save time.
+            data: data from `create_data`, to save time.
 
         Returns:
             `pin.StdVec_Force`, one per joint in its joint's frame: `fext` of `pin.rnea` and
@@ -127,38 +127,42 @@ class Knee(AssembledKnee):
             ComputationError: the contact model is out of its range, or the patella is not found.
         """
         data = self.create_data() if data is None else data
-        place = self._kinematics(data, q, v)
+        kinematics = self._kinematics(data, q, v)
         on_insert = np.zeros(6)
         if self.contact is not None:
-            contact = self._contact_at(data, place)
+            contact = self._contact_at(data, kinematics)
             on_insert = self.contact.wrench(contact, self.bridge.twist(data.data))
         if self._crossing is not None:
-            on_insert = on_insert + self._crossing.wrench(place.pose)
-        pulled = self._tensions(tensions)
-        links = summed(self._beside_the_contact(data, place, pulled))
+            on_insert = on_insert + self._crossing.wrench(kinematics.pose)
+        muscle_tensions = self._tensions(tensions)
+        links = summed(self._loads_beside_contact(data, kinematics, muscle_tensions))
         for link, sign in (("tibia", 1.0), ("femur", -1.0)):
             links[link] = links.get(link, np.zeros(6)) + sign * on_insert
-        return self._with_lines(data, pulled, self.bridge.joint_forces(data.data, links))
+        return self._with_lines(data, muscle_tensions, self.bridge.joint_forces(data.data, links))
 
-    def _beside_the_contact(
-        self, data: KneeData, place: KneePlace, pulled: Mapping[str, float]
+    def _loads_beside_contact(
+        self, data: KneeData, kinematics: KneePose, muscle_tensions: Mapping[str, float]
     ) -> list[PointForces]:
         """Return the loads of the extensor mechanism, and of ligaments that end on the patella."""
-        pulls, patella = self._pulls(pulled), None
+        pulls, patella = self._pulls(muscle_tensions), None
         if not self._others and not pulls:
             return []
         if self.extensor_lines is not None:
-            patella = self._find_patella(place, data)
-        poses, total = self._link_poses(place, patella), list[PointForces]()
+            patella = self._find_patella(kinematics, data)
+        poses, total = self._link_poses(kinematics, patella), list[PointForces]()
         if self._others:
             from tkamb.knee.ligaments import ligament_loads
 
             total += ligament_loads(self._others, poses)[1]
         if pulls:
             assert patella is not None and self.extensor_lines is not None
-            quadriceps = pulled[self._extensor_names[0]]
+            quadriceps = muscle_tensions[self._extensor_names[0]]
             total += self.extensor_lines.pull(
-                poses, patella, place.coordinates[5], quadriceps, pulled.get(PATELLAR_LIGAMENT)
+                poses,
+                patella,
+                kinematics.coordinates[5],
+                quadriceps,
+                muscle_tensions.get(PATELLAR_LIGAMENT),
             )
         return total
 
@@ -175,7 +179,7 @@ class Knee(AssembledKnee):
         Args:
             q: configuration, shape (nq,).
             v: velocity, shape (nv,).
-            data: data from `create_data`; they save time.
+            data: data from `create_data`, to save time.
             exact: False: use a tangent of the contact model even if it is approximate. The lattices
                 with a softening material have an approximate tangent.
 
@@ -183,13 +187,13 @@ class Knee(AssembledKnee):
             ComputationError: the contact model is out of its range.
         """
         data = self.create_data() if data is None else data
-        place = self._kinematics(data, q, v)
+        kinematics = self._kinematics(data, q, v)
         total = np.zeros((6, 6))
         if self.contact is not None:
             twist = self.bridge.twist(data.data)
-            contact = self._contact_at(data, place)
-            total += self.contact.stiffness(data.probe, place.pose, contact, twist, exact)
-        total += self._ligament_stiffness(place)
+            contact = self._contact_at(data, kinematics)
+            total += self.contact.stiffness(data.probe, kinematics.pose, contact, twist, exact)
+        total += self._ligament_stiffness(kinematics)
         return self._mirrored_matrix(total)
 
     def damping(self, q: Array, v: Array, data: KneeData | None = None) -> Array:
@@ -199,10 +203,10 @@ class Knee(AssembledKnee):
         conventions of `stiffness`. Only friction depends on the velocity.
         """
         data = self.create_data() if data is None else data
-        place = self._kinematics(data, q, v)
+        kinematics = self._kinematics(data, q, v)
         if self.contact is None:
             return np.zeros((6, 6))
-        contact = self._contact_at(data, place)
+        contact = self._contact_at(data, kinematics)
         return self._mirrored_matrix(self.contact.damping(contact, self.bridge.twist(data.data)))
 
     def inverse_dynamics(
@@ -217,9 +221,9 @@ class Knee(AssembledKnee):
     ) -> KneeLoads:
         """Return the loads of the knee in a given motion.
 
-        They solve the equations of motion of shank and patella (docs/equilibrium.md). Ligaments and
-        given muscles are known loads. Contact points are the closest points of the undeformed
-        bodies, or the resultants of `contact`.
+        The loads solve the equations of motion of shank and patella (docs/equilibrium.md). The
+        forces of ligaments and given muscles are known. Contact points are the closest points of
+        the undeformed bodies, or the resultants of `contact`.
 
         Args:
             q: configuration, shape (nq,).
@@ -230,7 +234,7 @@ class Knee(AssembledKnee):
             tensions: muscle of `muscles` -> tension, N. The tension of the quadriceps is unknown
                 and cannot be given.
             contact: a contact from `press` or `evaluate`; None: closest points.
-            data: data from `create_data`; they save time.
+            data: data from `create_data`, to save time.
 
         Returns:
             The loads. Without a solution they are NaN, and `problems` states the reasons.
@@ -264,7 +268,7 @@ class Knee(AssembledKnee):
         Args:
             q: configuration, shape (nq,).
             load: compressive force along the insert's y axis, 0 or more, N.
-            guess: an earlier result or a warm start; it saves time.
+            guess: an earlier result or a warm start, to save time.
 
         Returns:
             Pressure, area and forces of both condyles, in the insert frame of a right knee: a
@@ -283,13 +287,13 @@ class Knee(AssembledKnee):
         Args:
             q: configuration, shape (nq,).
             load: load of `press`, N.
-            start: warm start of the last press; it saves time.
+            start: warm start of the last press, to save time.
         """
         contact = self._need_contact()
         if not (np.isfinite(load) and load >= 0):
             raise InputError(f"load {load} N", "press", "give a load of 0 or more")
-        place = self._kinematics(self.create_data_for_kinematics(), q)
-        return contact.model.press_from(contact.state, float(load), place.pose, start)
+        kinematics = self._kinematics(self.create_data_for_kinematics(), q)
+        return contact.model.press_from(contact.state, float(load), kinematics.pose, start)
 
     def evaluate(self, q: Array, guess: "Guess | None" = None) -> "ContactResult":
         """Return the contact at q: pressure, area and forces from the overlap of the bodies.
@@ -297,8 +301,8 @@ class Knee(AssembledKnee):
         The result has the form of `press`, but the height of the femur is that of q.
         """
         contact = self._need_contact()
-        place = self._kinematics(self.create_data_for_kinematics(), q)
-        return contact.model.evaluate(contact.state, place.pose, guess)
+        kinematics = self._kinematics(self.create_data_for_kinematics(), q)
+        return contact.model.evaluate(contact.state, kinematics.pose, guess)
 
     def equilibrium(
         self,
@@ -323,7 +327,7 @@ class Knee(AssembledKnee):
             external: external forces, see `inverse_dynamics`.
             released: some of "ap", "ml", "axial_rotation", "adduction"; "si" is always released.
             tensions: muscle tensions, see `inverse_dynamics`.
-            data: data from `create_data`; they save time.
+            data: data from `create_data`, to save time.
 
         Raises:
             InputError: a coordinate is unknown, the knee has no contact model, or the joints
@@ -341,7 +345,7 @@ class Knee(AssembledKnee):
         probe = data.probe if data.probe is not None else contact.probe()
         search = ReleasedKnee(probe, released)
         points = {} if len(search.released) == 5 else self.nearest_points(instant.coordinates)
-        knee = self._rest(search, instant, points)
+        knee = self._knee_in_equilibrium(search, instant, points)
         result, q_end = None, np.array(q, float)
         geometry = replace(knee.geometry, problems=(knee.problem,))
         if not knee.problem:
@@ -366,8 +370,8 @@ class Knee(AssembledKnee):
     def show(self, viewer: Any, q: Array, **options: Any) -> None:
         """Draw the knee at q in a user's `pin.visualize.MeshcatVisualizer`.
 
-        It adds implant, ligaments, lines, force arrows and the pressure map below the viewer's root
-        node. `tkamb.knee.show.show_knee` describes the options.
+        Implant, ligaments, muscle lines, force arrows and the pressure map appear below the
+        viewer's root node. `tkamb.knee.show.show_knee` describes the options.
         """
         from tkamb.knee.show import show_knee
 
@@ -411,7 +415,7 @@ class Knee(AssembledKnee):
             a: acceleration, shape (nv,).
             external: external forces, see `inverse_dynamics`.
             tensions: muscle tensions, see `inverse_dynamics`.
-            data: data from `create_data`; they save time.
+            data: data from `create_data`, to save time.
             patella: object that finds the patella; None: the patella of q, or its equilibrium if q
                 has none.
             muscles: muscles of the leg that share the load; None: the quadriceps alone acts.
@@ -426,19 +430,21 @@ class Knee(AssembledKnee):
             raise InputError(
                 f"{len(external)} forces", "external", f"give one per joint, {self.model.njoints}"
             )
-        pulled = self._tensions(tensions)
-        if self._pulls(pulled):
+        muscle_tensions = self._tensions(tensions)
+        if self._pulls(muscle_tensions):
             raise InputError(
                 "the tension of the quadriceps is unknown", "tensions", "give other muscles alone"
             )
         bridge, pin_data, lines = self.bridge, data.data, self.extensor_lines
         pin.forwardKinematics(self.model, pin_data, q, v, a)
-        external = self._with_lines(data, pulled, external)
+        external = self._with_lines(data, muscle_tensions, external)
         motion = bridge.motion(pin_data, lines is not None)
         if lines is not None and patella is None:
-            own = None if self._finds_patella else motion.joints[0, 6:]
+            patella_coordinates = None if self._finds_patella else motion.joints[0, 6:]
             assert self.extensor is not None
-            patella = PatellaAt(lines, knee_pose(motion.joints[0, :6]), own, self.extensor.solved)
+            patella = PatellaAt(
+                lines, knee_pose(motion.joints[0, :6]), patella_coordinates, self.extensor.solved
+            )
         return Instant(
             self.chain,
             motion,
@@ -453,21 +459,23 @@ class Knee(AssembledKnee):
             muscles,
         )
 
-    def _contact_at(self, data: KneeData, place: KneePlace) -> "ProbedContact":
+    def _contact_at(self, data: KneeData, kinematics: KneePose) -> "ProbedContact":
         """Return the contact at a pose. The last contact is stored in `data`."""
-        key = place.pose.tobytes()
+        key = kinematics.pose.tobytes()
         if data.seen is None or data.seen[0] != key:
             assert self.contact is not None
-            data.seen = key, self.contact.at(data.probe, place.pose)
+            data.seen = key, self.contact.at(data.probe, kinematics.pose)
         return data.seen[1]
 
-    def _ligament_stiffness(self, place: KneePlace) -> Array:
+    def _ligament_stiffness(self, kinematics: KneePose) -> Array:
         """Return the stiffness (6, 6) of the ligaments between femur and tibia."""
         if self._crossing is None:
             return np.zeros((6, 6))
         from tkamb.knee.contact import DifferenceSettings, batch_differences
 
-        return batch_differences(self._crossing.wrench, place.pose, DifferenceSettings(step=1e-7))
+        return batch_differences(
+            self._crossing.wrench, kinematics.pose, DifferenceSettings(step=1e-7)
+        )
 
     def _mirrored_matrix(self, matrix: Array) -> Array:
         if not self.left:
@@ -479,11 +487,13 @@ class Knee(AssembledKnee):
         geometry, loads = instant.solved(geometry)
         return knee_loads(geometry, loads, self.friction, self.bridge, data.data)
 
-    def _rest(self, search: Any, instant: Instant, points: dict[str, Array]) -> "KneeEquilibrium":
+    def _knee_in_equilibrium(
+        self, search: Any, instant: Instant, points: dict[str, Array]
+    ) -> "KneeEquilibrium":
         """Return the knee in equilibrium. The initial guess is first touch at the pose of q."""
         from tkamb.knee.starts import InitialPoses
 
         pair = self._need_contact().pair
         if not np.isfinite(pair.first_touch_height(knee_pose(instant.coordinates))):
             raise ComputationError("the femoral component does not lie over the insert", "q")
-        return InitialPoses(search, pair, None).rest(instant, (), points)
+        return InitialPoses(search, pair, None).equilibrium(instant, (), points)

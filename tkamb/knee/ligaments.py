@@ -12,9 +12,8 @@ toe does not.
 
 `generic_ligaments` scales a set of bundles to the implant, for a patient without measured
 ligaments. Positions of the femoral ends are relative to the axis of the posterior condyles, because
-collaterals are nearly isometric near this axis. Positions of the distal ends are relative to the
-insert's flat bottom. The proportions are those of an average knee: check the strain table before
-using any force.
+collaterals are nearly isometric near this axis. The proportions are those of an average knee: check
+the strain table before using any force.
 
 References: Abdel-Rahman & Hefzy, Med Eng Phys 20:276 (1998) (stiffness); Blankevoort & Huiskes,
 J Biomech Eng 113:263 (1991), doi:10.1115/1.2894883 (law, strains at extension).
@@ -44,8 +43,8 @@ class LigamentSettings:
     """1: eps1 of every ligament. The toe region ends at twice this strain. Source: Blankevoort &
     Huiskes (1991)."""
     max_reference_distance: float = 15.0 * DEGREE
-    """rad: largest difference between the reference flexion and the flexion of the frame that is
-    used as reference pose. Chosen because at a larger difference a ligament has another strain."""
+    """rad: largest difference between the reference flexion and the flexion of the nearest frame.
+    Chosen because at a larger difference the strain differs."""
 
 
 LIGAMENT = LigamentSettings()
@@ -113,7 +112,7 @@ class Ligament:
         return np.asarray(np.linalg.norm(distal - proximal, axis=-1))
 
     def strain(self, length: ArrayLike) -> Array:
-        """Return (L - L0)/L0."""
+        """Return the strain (L - L0)/L0 at a length L (m)."""
         return np.asarray(length, float) / self.slack_length - 1.0
 
     def force(self, length: ArrayLike) -> Array:
@@ -190,15 +189,15 @@ def ligament_loads(
     points = [*(bundle.proximal for bundle in ligaments), *(bundle.distal for bundle in ligaments)]
     links = np.array([point.link for point in points]).reshape(2, -1)
     link_poses = np.array([poses[point.link] for point in points], float)
-    places = np.array([point.position for point in points], float)
-    ends = np.einsum("nij,nj->ni", link_poses[:, :3, :3], places) + link_poses[:, :3, 3]
+    positions = np.array([point.position for point in points], float)
+    ends = np.einsum("nij,nj->ni", link_poses[:, :3, :3], positions) + link_poses[:, :3, 3]
     ends = ends.reshape(2, -1, 3)
     tension, pull = BundleArrays.of(ligaments, *ends).pulls(*ends)
     loads = []
     for link in dict.fromkeys(links.ravel().tolist()):
-        own = links == link
-        forces = np.concatenate([-pull[own[0]], pull[own[1]]])
-        loads.append(PointForces(link, ends[own], forces))
+        on_link = links == link
+        forces = np.concatenate([-pull[on_link[0]], pull[on_link[1]]])
+        loads.append(PointForces(link, ends[on_link], forces))
     return tension, tuple(loads)
 
 
@@ -207,9 +206,8 @@ def build_ligaments(
 ) -> tuple[Ligament, ...]:
     """Return the bundles with slack lengths.
 
-    A missing slack length is computed from the reference strain eps_r. The bundle has this strain
-    in the frame nearest to the reference flexion. If its length in that frame is L_r,
-    L0 = L_r/(1 + eps_r).
+    A missing slack length is computed from the reference strain eps_r, the strain in the frame
+    nearest to the reference flexion. With the length L_r in that frame, L0 = L_r/(1 + eps_r).
 
     Args:
         ligaments: the bundles.
@@ -245,7 +243,7 @@ def _with_slack_length(bundle: Ligament, poses: Mapping[str, Array], flexion: Ar
             f"motion's angle_unit: flexion is read as {np.nanmin(flexion) / DEGREE:.3g} to "
             f"{np.nanmax(flexion) / DEGREE:.3g} deg",
         )
-    # Strain is relative to the slack length: e = L / L0 - 1, solved for L0.
+    # The definition of the strain, e = L / L0 - 1, solved for L0.
     return replace(bundle, slack_length=length / (1.0 + bundle.reference_strain))
 
 
@@ -261,7 +259,7 @@ def strain_table(
     at_deg: Sequence[float] = (0.0, 60.0, 90.0),
     within_deg: float = 10.0,
 ) -> dict[str, tuple[float, ...]]:
-    """Return the strain of each bundle at a few flexions. It reveals a wrong insertion.
+    """Return the strain of each bundle at a few flexions. An unlikely strain reveals a wrong end.
 
     Args:
         ligaments: the bundles.
@@ -275,14 +273,14 @@ def strain_table(
         bundle -> strain at each flexion.
     """
     frames = [nearest_frame(flexion, angle * DEGREE) for angle in at_deg]
-    reached = [
+    is_near = [
         abs(flexion[k] - angle * DEGREE) <= within_deg * DEGREE
         for k, angle in zip(frames, at_deg, strict=True)
     ]
     table = {}
     for bundle in ligaments:
         strain = [float(bundle.strain(bundle.length(_frame(poses, k)))) for k in frames]
-        table[bundle.name] = tuple(s if r else np.nan for s, r in zip(strain, reached, strict=True))
+        table[bundle.name] = tuple(s if r else np.nan for s, r in zip(strain, is_near, strict=True))
     return table
 
 
@@ -298,8 +296,8 @@ class LigamentSideSettings:
 
     wrong_side_distance: float = 8.0 * MILLIMETRE
     """m: an end farther than this beyond the middle of the knee is on the wrong side. Chosen
-    because collateral ligaments end 20 to 45 mm from the middle, and frames are displaced by less
-    than this distance."""
+    because collateral ligaments end 20 to 45 mm from the middle, and the frames' origins lie closer
+    to the middle than this distance."""
 
 
 LIGAMENT_SIDE = LigamentSideSettings()
@@ -331,14 +329,14 @@ def check_collateral_sides(ligaments: Iterable[Ligament], chain: Chain, side: st
     for bundle in ligaments:
         sign = _lateral_sign(bundle.name)
         for name, end in (("proximal", bundle.proximal), ("distal", bundle.distal)):
-            lateral = _lateral_place(end, chain)
+            lateral = _lateral_position(end, chain)
             if sign * lateral < -LIGAMENT_SIDE.wrong_side_distance:
-                opposite, own = ("lateral", "medial") if sign < 0 else ("medial", "lateral")
+                opposite, named_side = ("lateral", "medial") if sign < 0 else ("medial", "lateral")
                 raise InputError(
                     f"its {name} end lies {abs(lateral) / MILLIMETRE:.0f} mm on the {opposite} "
-                    f"side of this {side} knee, but by its name it is a {own} ligament",
+                    f"side of this {side} knee, but by its name it is a {named_side} ligament",
                     f"[[ligament]] {bundle.name}",
-                    "turn the sign of z in point_mm (z points to the right on either side), or "
+                    "change the sign of z in point_mm (z points to the right in both knees), or "
                     "correct [patient] side or the name",
                 )
 
@@ -349,13 +347,13 @@ def _lateral_sign(name: str) -> int:
     return int(lateral) - int(medial)
 
 
-def _lateral_place(end: LinkPoint, chain: Chain) -> float:
+def _lateral_position(end: LinkPoint, chain: Chain) -> float:
     """Return the lateral position (m) of an end in the frame of insert, femur or patella."""
     carrier = chain.carrier(end.link)
-    place = transform(chain.link_in(end.link, carrier), end.position)
+    position = transform(chain.link_in(end.link, carrier), end.position)
     if carrier == "tibia":
-        place = transform(inverse(chain.insert_in_tibia), place)
-    return float(place[2])
+        position = transform(inverse(chain.insert_in_tibia), position)
+    return float(position[2])
 
 
 PREFIX = "generic_"
@@ -363,7 +361,7 @@ PREFIX = "generic_"
 
 @dataclass(frozen=True)
 class _Bundle:
-    """One generic bundle of a right knee (ends: see `BUNDLES`); the strain is in extension."""
+    """One bundle of `BUNDLES`; the strain is that in extension."""
 
     proximal: tuple[float, float, float]
     distal: tuple[float, float, float]
@@ -435,11 +433,11 @@ def generic_ligaments(
 def condylar_axis(femoral: Surface) -> Array:
     """Return the centre (3,) of the circle that fits the posterior condyles, m.
 
-    It is a point of the condylar axis, which is parallel to z. At a flexion phi let u be the
+    The centre lies on the condylar axis, which is parallel to z. At a flexion phi let u be the
     downward direction in the femur's frame. The support of the component in this direction is the
-    maximum of u . p over the vertices p. For a circle of centre c and radius r the support is
-    u . c + r. c and r are fitted by least squares to the supports at 20 to 100 deg of flexion. z is
-    the middle of the component's width.
+    maximum of u . p over the vertices p. A circle of centre c and radius r has the support
+    u . c + r. Least squares fit c and r to the supports at 20 to 100 deg of flexion. The z of the
+    centre is the middle of the component's width.
 
     Args:
         femoral: surface of the femoral component in the femur's frame.

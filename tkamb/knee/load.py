@@ -91,11 +91,13 @@ def link_point(point: Point) -> LinkPoint:
     elif isinstance(point, tuple | list) and len(point) == 2:
         link, position = point
     try:
-        place = np.asarray(position, float)
+        coordinates = np.asarray(position, float)
     except (TypeError, ValueError):
-        place = np.empty(0)
-    if not isinstance(link, str) or place.shape != (3,) or not np.isfinite(place).all():
+        coordinates = np.empty(0)
+    if not isinstance(link, str) or coordinates.shape != (3,) or not np.isfinite(coordinates).all():
         raise InputError(
-            f"{point!r} is no point on a frame", "Knee", "give (frame name, (x, y, z)) in metres"
+            f"{point!r} is not a point on a frame",
+            "Knee",
+            "give (frame name, (x, y, z)) in metres",
         )
-    return LinkPoint(link, place)
+    return LinkPoint(link, coordinates)

@@ -12,8 +12,8 @@ from tkamb.knee.load import PointForces, scaled
 from tkamb.knee.unknowns import MUSCLE, muscle_load
 
 MIRRORED = ("ml", "axial", "coronal")
-"""Endings of load names. These loads change sign between a left knee and its mirror image: forces
-along z, moments about y and x."""
+"""Endings of the names of loads that change sign in the mirror image: forces along z, moments about
+y and x."""
 NAN = float("nan")
 
 
@@ -21,8 +21,9 @@ NAN = float("nan")
 class KneeLoads:
     """Loads of the knee at one instant, SI, in the insert frame; NaN without a solution.
 
-    The insert frame is x anterior, y superior, z to the patient's right, for left knees too. The
-    four extensor loads are NaN without an extensor mechanism.
+    The insert frame has x anterior, y superior and z to the patient's right, for left knees too.
+    Without an extensor mechanism the four loads from `quadriceps` to `patellofemoral_tangential`
+    are NaN.
 
     Args:
         contact_force: force of the insert on the femur without residuals, shape (3,), N.
@@ -44,8 +45,8 @@ class KneeLoads:
         ambiguous: whether a second load state has no wrong sign either.
         problems: reasons why there is no solution; empty: there is a solution.
         external_forces: `pin.StdVec_Force` of contact, ligaments and extensor mechanism, as `fext`
-            of the model. With these and the external loads the result of `pin.rnea` at the knee is
-            the residuals.
+            of the model. With these and the external loads `pin.rnea` gives the residuals at the
+            knee.
         residual_forces: `pin.StdVec_Force` of the residuals.
         hip_forces: `pin.StdVec_Force` of the loads across the hip, on the thigh.
         equations: the solution of the equations of a right knee.
@@ -84,7 +85,7 @@ class KneeLoads:
     def tensions(self) -> dict[str, float]:
         """Muscle or "patellar_ligament" -> tension, N, as input of `Knee.external_forces`.
 
-        It is empty without an extensor mechanism.
+        The result is empty without an extensor mechanism.
         """
         extensor, values = self.geometry.extensor, self.equations.values
         if extensor is None:

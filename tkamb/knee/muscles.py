@@ -1,8 +1,8 @@
-"""Muscles and their lines of action, as columns of the equations or with given tensions.
+"""Muscles and their lines of action, with unknown or given tensions.
 
 A line of action is a massless string through points of the links. It may wrap the outline of one
 link. The forces of a unit tension on all links of the line are one column of the equations of
-motion. The moment arm of a line of length L about a coordinate q of the chain is then -dL/dq.
+motion. The moment arm of a line of length L about a coordinate q of the chain is -dL/dq.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,7 +16,7 @@ import pinocchio as pin
 from tkamb.errors import ComputationError, InputError, names_near
 from tkamb.geometry.frames import Array, cross, transform
 from tkamb.geometry.polygons import sagittal_outline
-from tkamb.knee.anatomy import Anatomy, Place
+from tkamb.knee.anatomy import Anatomy, FixedFrame
 from tkamb.knee.load import LinkPoint, PointForces, link_point
 
 if TYPE_CHECKING:
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MuscleBandSettings:
-    """The outline that a muscle wraps."""
+    """Settings of the outline that a muscle or ligament wraps."""
 
     sections: int = 7
-    """Number of sagittal sections across the band. The line wraps their common outline. Chosen
-    because more sections hardly change the lines."""
+    """Number of sagittal sections across the band. A line wraps the convex outline of all sections.
+    Chosen because more sections hardly change the lines."""
 
 
 MUSCLE_BAND = MuscleBandSettings()
@@ -74,7 +74,7 @@ class Muscle:
         wrap: wrapping of the femoral component by the segment that leaves the femur; None: this
             segment is straight.
         strength: maximal isometric force, N; NaN: unknown.
-        group: name of the group of muscles with which it is shown; empty: it is shown alone.
+        group: name of the group with which the muscle is shown; empty: it is shown alone.
     """
 
     name: str
@@ -108,12 +108,12 @@ class Wrap:
     Args:
         link: name of the link with the outline; the reaction acts on this link.
         outline: convex polygon in the link's x-y plane, shape (n, 2), m.
-        stretch: number of the segment; segment 0 is between the first two points.
+        segment: number of the segment; segment 0 is between the first two points.
     """
 
     link: str
     outline: Array
-    stretch: int = 0
+    segment: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,23 +141,23 @@ class Line:
         """
         from tkamb.knee.wrapping import TautPath, path_in_link  # imports numba
 
-        places = [transform(poses[point.link], point.position) for point in self.points]
-        stretches = []
-        for i, (start, end) in enumerate(pairwise(places)):
-            wrapped = self.wrap if self.wrap and self.wrap.stretch == i else None
+        positions = [transform(poses[point.link], point.position) for point in self.points]
+        segments = []
+        for i, (start, end) in enumerate(pairwise(positions)):
+            wrapped = self.wrap if self.wrap and self.wrap.segment == i else None
             outline, link = (wrapped.outline, wrapped.link) if wrapped else (None, None)
             pose = np.eye(4) if link is None else np.asarray(poses[link], float)
             try:
-                stretches.append(path_in_link(start, end, outline, pose))
+                segments.append(path_in_link(start, end, outline, pose))
             except ComputationError as error:
                 raise ComputationError(error.what, self.name) from None
-        if len(stretches) == 1:
-            return stretches[0]
-        points = [stretches[0].points, *(stretch.points[1:] for stretch in stretches[1:])]
+        if len(segments) == 1:
+            return segments[0]
+        points = [segments[0].points, *(segment.points[1:] for segment in segments[1:])]
         return TautPath(
             np.concatenate(points),
-            sum(stretch.length for stretch in stretches),
-            sum(stretch.wrap_angle for stretch in stretches),
+            sum(segment.length for segment in segments),
+            sum(segment.wrap_angle for segment in segments),
         )
 
     def loads(self, path: "TautPath") -> tuple[PointForces, ...]:
@@ -168,10 +168,11 @@ class Line:
         """
         links = [point.link for point in self.points]
         if self.wrap:
-            at = self.wrap.stretch + 1
-            links[at:at] = [self.wrap.link] * (len(path.points) - len(links))
-        along = path.directions
-        forces = np.concatenate([along[:1], np.diff(along, axis=0), -along[-1:]])
+            index = self.wrap.segment + 1
+            links[index:index] = [self.wrap.link] * (len(path.points) - len(links))
+        directions = path.directions
+        forces = np.concatenate([directions[:1], np.diff(directions, axis=0), -directions[-1:]])
+        # Several inner points on one link become one load.
         inner = np.array(links[1:-1])
         return (
             PointForces(links[0], path.points[:1], forces[:1]),
@@ -193,7 +194,7 @@ def off_femur(points: Sequence[LinkPoint], chain: "Chain") -> int:
     for i, (one, other) in enumerate(pairwise(carriers)):
         if one == "femur" != other:
             return i
-    raise InputError("no stretch of the path leaves the femur", None, "check its points' links")
+    raise InputError("no segment of the line leaves the femur", None, "check its points' links")
 
 
 def muscle_line(muscle: Muscle, chain: "Chain", femoral: "Surface") -> Line:
@@ -206,14 +207,14 @@ def muscle_line(muscle: Muscle, chain: "Chain", femoral: "Surface") -> Line:
     """
     if muscle.wrap is None:
         return Line(muscle.name, muscle.points)
-    stretch = off_femur(muscle.points, chain)
-    last = muscle.points[stretch]
+    segment = off_femur(muscle.points, chain)
+    last = muscle.points[segment]
     outline = muscle.wrap.outline(
         femoral,
         float(chain.patella_joint_in_femur[2, 3]),
         below=float(transform(chain.link_in(last.link, "femur"), last.position)[1]),
     )
-    return Line(muscle.name, muscle.points, Wrap("femur", outline, stretch))
+    return Line(muscle.name, muscle.points, Wrap("femur", outline, segment))
 
 
 def check_muscles(muscles: Sequence[Muscle], chain: "Chain") -> None:
@@ -240,10 +241,10 @@ def check_muscles(muscles: Sequence[Muscle], chain: "Chain") -> None:
         ends = [chain.carrier(muscle.points[i].link) for i in (0, -1)]
         if ends != ["femur", "patella"]:
             raise InputError(
-                f"runs from {ends[0]} to {ends[1]}: [[muscle]] tables have no static optimisation, "
-                "which such a muscle needs",
+                f"runs from {ends[0]} to {ends[1]}: such a muscle needs static optimisation, which "
+                "[[muscle]] tables do not have",
                 f"[[muscle]] {muscle.name}",
-                "give one muscle from the femur to the patella; [muscles] takes the others",
+                "give one muscle from the femur to the patella; give the others in [muscles]",
             )
 
 
@@ -252,11 +253,11 @@ class TensionLine:
     """A straight line of given tension between points of a user's model.
 
     Args:
-        places: frame of each point.
+        frames: frame of each point.
         positions: position (3,) of each point in its frame, m.
     """
 
-    places: tuple[Place, ...]
+    frames: tuple[FixedFrame, ...]
     positions: tuple[Array, ...]
 
     def forces(self, data: Any, tension: float) -> list[tuple[int, pin.Force]]:
@@ -266,22 +267,24 @@ class TensionLine:
             data: Pinocchio data with joint placements up to date.
             tension: tension, N.
         """
-        placements = [data.oMi[place.joint] for place in self.places]
+        placements = [data.oMi[frame.joint] for frame in self.frames]
         points = [
-            placement.act(place.placement.act(position))
-            for placement, place, position in zip(
-                placements, self.places, self.positions, strict=True
+            placement.act(frame.placement.act(position))
+            for placement, frame, position in zip(
+                placements, self.frames, self.positions, strict=True
             )
         ]
         steps = np.diff(np.array(points), axis=0)
-        along = steps / np.linalg.norm(steps, axis=1, keepdims=True)
+        directions = steps / np.linalg.norm(steps, axis=1, keepdims=True)
         # The tension pulls the ends along the line. At an inner point the force is the change of
         # direction.
-        pulls = tension * np.concatenate([along[:1], np.diff(along, axis=0), -along[-1:]])
+        pulls = tension * np.concatenate(
+            [directions[:1], np.diff(directions, axis=0), -directions[-1:]]
+        )
         return [
-            (place.joint, placement.actInv(pin.Force(pull, cross(point, pull))))
-            for placement, place, point, pull in zip(
-                placements, self.places, points, pulls, strict=True
+            (frame.joint, placement.actInv(pin.Force(pull, cross(point, pull))))
+            for placement, frame, point, pull in zip(
+                placements, self.frames, points, pulls, strict=True
             )
         ]
 
@@ -297,12 +300,12 @@ def tension_lines(muscles: Iterable[Muscle], anatomy: Anatomy) -> dict[str, Tens
         points = [link_point(point) for point in muscle.points]
         if len(points) < 2 or muscle.wrap is not None:
             raise InputError(
-                "is no straight line over two points or more",
+                "is not a straight line through two or more points",
                 f"muscle {muscle.name}",
-                "give its points; a quadriceps that wraps belongs to extensor=",
+                "give two or more points, and a quadriceps that wraps in extensor=",
             )
-        places = tuple(anatomy.frame(point.link) for point in points)
-        lines[muscle.name] = TensionLine(places, tuple(point.position for point in points))
+        frames = tuple(anatomy.frame(point.link) for point in points)
+        lines[muscle.name] = TensionLine(frames, tuple(point.position for point in points))
     return lines
 
 
@@ -323,12 +326,16 @@ def checked_tensions(
         return {}
     if not isinstance(tensions, Mapping):
         if not extensor:
-            raise InputError("has no quadriceps", "tensions", "give extensor=, or names")
+            raise InputError(
+                "the knee has no quadriceps", "tensions", "give extensor=, or muscle -> tension"
+            )
         tensions = {extensor[0]: tensions}
     names = (*extensor, *lines)
     for name, tension in tensions.items():
         if name not in names:
             raise InputError(f"no muscle '{name}'", "tensions", names_near(name, list(names)))
         if not (np.isfinite(tension) and tension >= 0.0):
-            raise InputError(f"tension {tension} N", f"muscle {name}", "a muscle only pulls")
+            raise InputError(
+                f"tension {tension} N", f"muscle {name}", "a muscle only pulls: give 0 or more"
+            )
     return {name: float(tension) for name, tension in tensions.items()}

@@ -13,7 +13,7 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, Array, inverse, mirrored_pose, transform
 from tkamb.geometry.surface import Surface
-from tkamb.knee.anatomy import Anatomy, Place
+from tkamb.knee.anatomy import Anatomy, FixedFrame
 from tkamb.knee.canonical import Bridge, se3
 from tkamb.knee.chain import Chain
 from tkamb.knee.load import link_point
@@ -52,10 +52,10 @@ class Implant:
     Args:
         femoral: mesh of the femoral component, in the axes of the frame "femoral" (see
             `tkamb.Knee`): x anterior, y superior, z to the patient's right.
-        insert: closed mesh of the polyethylene insert, in the axes of the frame "insert": x
-            anterior, y superior, z to the patient's right. Its flat bottom faces -y.
-        patella: mesh of the patellar button, in the axes of the frame "patella". Its articular side
-            faces -x.
+        insert: closed mesh of the polyethylene insert, in the axes of the frame "insert", which
+            have the same directions. The flat bottom faces -y.
+        patella: mesh of the patellar button, in the axes of the frame "patella". The articular
+            side faces -x.
         material: material of the insert, a name (`tkamb.contact.materials.MATERIALS`) or a
             `Material`.
         bearing: "fixed" (bottom glued) or "mobile" (bottom slides).
@@ -83,8 +83,8 @@ class Extensor:
     """Quadriceps, patella and patellar ligament.
 
     The patella moves in a sagittal plane of the femur. If the model has a frame "patella" that
-    moves relative to the femur, q gives the pose of the patella. Otherwise the equilibrium of a
-    massless patella gives it, with a constant length of the ligament.
+    moves relative to the femur, q gives the pose of the patella. Otherwise the pose is that of a
+    massless patella in equilibrium, with a constant length of the ligament.
 
     Args:
         quadriceps: muscle from the femur to the patella.
@@ -92,8 +92,8 @@ class Extensor:
             not give the pose of the patella.
         plane: pose of the plane's frame in the frame "femur"; None: the placement of the joint
             "patella_ap", or the frame "femur" if the model has no such joint.
-        solved: True: if `Knee.equilibrium` moves the femur, the patella of the model is solved
-            again. False: it is fixed to the femur.
+        solved: whether `Knee.equilibrium` solves the patella of the model again when the femur
+            moves. False: the patella moves with the femur.
     """
 
     quadriceps: Muscle
@@ -131,30 +131,30 @@ def as_surface(mesh: Mesh, name: str, closed: bool = False) -> Surface:
             name,
             "meshes are in metres: multiply millimetres by 1e-3",
         )
-    mended = repair(vertices, faces)
-    if mended.one_sided or len(mended.faces) < 4 or len(mended.forks):
+    repaired = repair(vertices, faces)
+    if repaired.one_sided or len(repaired.faces) < 4 or len(repaired.forks):
         raise InputError("is not one triangulated surface", name, "give the part's outer skin")
-    if closed and mended.holes:
-        width = mended.holes[0].width
+    if closed and repaired.holes:
+        width = repaired.holes[0].width
         raise InputError(
             f"is not closed: its widest hole is {width:.3g} m across", name, "close the mesh"
         )
-    return Surface(mended.vertices, mended.faces, name, merged=True)
+    return Surface(repaired.vertices, repaired.faces, name, merged=True)
 
 
 def _arrays(mesh: Mesh, name: str) -> tuple[Array, Any]:
     """Return vertices (n, 3) and triangles (k, 3) of a mesh object or a pair of arrays."""
-    how = "give a trimesh.Trimesh, or vertices (n, 3) in metres and triangles (k, 3)"
+    hint = "give a trimesh.Trimesh, or vertices (n, 3) in metres and triangles (k, 3)"
     parts = (mesh.vertices, mesh.faces) if hasattr(mesh, "faces") else mesh
     try:
         vertices, faces = (np.asarray(part) for part in parts)
     except (TypeError, ValueError):
-        raise InputError("is no mesh", name, how) from None
+        raise InputError("is not a mesh", name, hint) from None
     triangles = vertices.ndim == faces.ndim == 2 and vertices.shape[1] == faces.shape[1] == 3
     if not triangles or not len(faces) or not np.issubdtype(faces.dtype, np.integer):
-        raise InputError("is no triangle mesh", name, how)
+        raise InputError("is not a triangle mesh", name, hint)
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError("has triangles with vertex numbers out of range", name, how)
+        raise InputError("has triangles with vertex numbers out of range", name, hint)
     return vertices.astype(float), faces.astype(np.int64)
 
 
@@ -169,8 +169,8 @@ class AssemblySettings:
     """Tolerance of the assembly."""
 
     frame_tolerance: float = 1e-9
-    """m and rad: a smaller difference between the mesh frame and the frame of the flat bottom is
-    ignored. Chosen because it is above rounding errors."""
+    """m and rad: difference between the mesh frame and the frame of the flat bottom below which the
+    two are equal. Chosen because it is above rounding errors."""
 
 
 ASSEMBLY = AssemblySettings()
@@ -217,20 +217,20 @@ def surfaces_of(
 
 def placed_insert(
     anatomy: Anatomy, implant: Implant, insert: Surface | None, is_left: bool
-) -> tuple[Place, Surface | None]:
+) -> tuple[FixedFrame, Surface | None]:
     """Return the insert frame on the tibia, and the insert's surface in that frame."""
-    place = anatomy.insert
+    frame = anatomy.insert
     if insert is None or implant.placed:
-        return place, insert
+        return frame, insert
     from tkamb.geometry.flat_bottom import insert_placement
 
     placement = insert_placement(insert)
     if np.abs(placement - np.eye(4)).max() < ASSEMBLY.frame_tolerance:
-        return place, insert
-    # The placement is that of the mirrored mesh: a left knee needs its mirror image.
+        return frame, insert
+    # A left knee needs the mirror image, because the placement is that of the mirrored mesh.
     mesh_in_insert = mirrored_pose(placement) if is_left else placement
-    moved = Place(place.joint, place.placement * se3(inverse(mesh_in_insert)))
-    return moved, insert.moved(placement)
+    moved_frame = FixedFrame(frame.joint, frame.placement * se3(inverse(mesh_in_insert)))
+    return moved_frame, insert.moved(placement)
 
 
 def bundle_on_chain(bridge: Bridge, bundle: "Ligament") -> "Ligament":
@@ -271,8 +271,8 @@ def crossing_and_others(
     ends: dict[str, list[Array]] = {"femur": [], "tibia": []}
     for bundle in crossing:
         for end in (bundle.proximal, bundle.distal):
-            at = transform(shank, end.position) if end.link == "tibia" else end.position
-            ends[end.link].append(at)
+            position = transform(shank, end.position) if end.link == "tibia" else end.position
+            ends[end.link].append(position)
     arrays = BundleArrays.of(crossing, np.array(ends["femur"]), np.array(ends["tibia"]))
     return arrays, others
 

@@ -18,10 +18,10 @@ from tkamb.knee.wrapping import TautPath, path_in_link
 
 @dataclass(frozen=True)
 class PatellaSettings:
-    """Limit at which the forces on the patella are not determined."""
+    """Limit below which the forces on the patella are not determined."""
 
     least_determinant: float = 1e-6
-    """1: determinant of the unit vectors of contact normal and ligament, below which they are
+    """1: determinant of the unit vectors of contact normal and ligament below which the two are
     parallel. Chosen because it is above rounding errors."""
 
 
@@ -54,8 +54,8 @@ class PatellaState:
     Args:
         coordinates: patella_ap, patella_si (m) and patella_rotation (rad), shape (3,); NaN: not
             found.
-        contact_point: point on the line of action of the contact force, insert frame, shape (3,),
-            m.
+        contact_point: contact point, on the line of action of the contact force, insert frame,
+            shape (3,), m.
         contact_normal: unit normal from femur to patella in the femur's sagittal plane, insert
             frame, shape (3,).
         contact_on_patella: contact point in the patella's frame, shape (3,), m.
@@ -67,7 +67,7 @@ class PatellaState:
         tilt: first-order estimate of the tilt about y, rad.
         status: how the search ended.
         slopes: approximate derivatives of gap, ligament length and moment per unit tension (m) by
-            the coordinates, shape (3, 3). They shorten a later search; None: unknown.
+            the coordinates, shape (3, 3), as input of a later search; None: unknown.
     """
 
     coordinates: Array
@@ -85,7 +85,7 @@ class PatellaState:
 
 @dataclass(frozen=True, eq=False)
 class ExtensorMechanism:
-    """The extensor mechanism as input of the search for the patella. It is constant over frames.
+    """The extensor mechanism as input of the search for the patella, constant over frames.
 
     Args:
         contact: contact of button and femoral component, in the patellar joint's frame.
@@ -114,7 +114,10 @@ class ExtensorMechanism:
 
 @dataclass(frozen=True, eq=False)
 class PatellaBalance:
-    """Forces on the patella per unit muscle tension, in the patellar joint's frame."""
+    """Forces on the patella per unit muscle tension, in the patellar joint's frame.
+
+    `moment` is the residual moment per unit tension, m. `slopes` are those of `PatellaState`.
+    """
 
     coordinates: Array
     contact: PatellarContact
@@ -177,30 +180,36 @@ class PatellaFrame:
 
     def balance_at(self, coordinates: Array, contact: PatellarContact) -> PatellaBalance:
         """Return the result of `balance` for a known contact."""
-        m = self.mechanism
-        patella_pose = m.contact.pose(coordinates)
+        mechanism = self.mechanism
+        patella_pose = mechanism.contact.pose(coordinates)
         muscle = path_in_link(
-            self.origin, transform(patella_pose, m.muscle_insertion), m.femoral_outline, self.femur
+            self.origin,
+            transform(patella_pose, mechanism.muscle_insertion),
+            mechanism.femoral_outline,
+            self.femur,
         )
         ligament = path_in_link(
-            transform(patella_pose, m.ligament_proximal),
+            transform(patella_pose, mechanism.ligament_proximal),
             self.tuberosity,
-            m.insert_outline,
+            mechanism.insert_outline,
             self.insert,
         )
         # Unit forces on the patella: the muscle pulls it towards the origin, the ligament towards
         # the tibia.
-        pull, hold = -muscle.end_direction[:2], ligament.start_direction[:2]
-        sides = np.column_stack([hold, contact.normal[:2]])
-        if abs(np.linalg.det(sides)) < PATELLA.least_determinant:
+        muscle_direction, ligament_direction = (
+            -muscle.end_direction[:2],
+            ligament.start_direction[:2],
+        )
+        directions = np.column_stack([ligament_direction, contact.normal[:2]])
+        if abs(np.linalg.det(directions)) < PATELLA.least_determinant:
             raise ComputationError("the patellar ligament runs along the contact normal")
         # Force equilibrium in the sagittal plane, per newton of muscle tension: two equations for
         # the ligament tension and the contact force.
-        ligament_force, normal_force = np.linalg.solve(sides, -pull)
+        ligament_force, normal_force = np.linalg.solve(directions, -muscle_direction)
         # The residual moment about the origin vanishes in equilibrium.
         moment = (
-            _cross(muscle.points[-1], pull)
-            + ligament_force * _cross(ligament.points[0], hold)
+            _cross(muscle.points[-1], muscle_direction)
+            + ligament_force * _cross(ligament.points[0], ligament_direction)
             + normal_force * _cross(contact.point, contact.normal)
         )
         return PatellaBalance(
@@ -214,7 +223,7 @@ class PatellaFrame:
         )
 
     def state(self, balance: PatellaBalance, status: PatellaStatus) -> PatellaState:
-        """Return the state of a balance, in the insert frame."""
+        """Return the state of the patella from the forces on it, in the insert frame."""
         contact = balance.contact
         in_patella = inverse(self.mechanism.contact.pose(balance.coordinates))
         return PatellaState(

@@ -7,11 +7,11 @@ equations of a massless patella without friction:
     length of the patellar ligament = its given length
     muscle, ligament and contact force meet in one point (moment balance in the plane)
 
-By virtual work, the third equation states that the muscle's length is stationary among all
-positions that satisfy the first two. A stable patella is at a minimum of this length. Near a known
-solution, Newton's method solves the three equations together. Broyden's updates improve its
-Jacobian, which the code calls slopes. Without a known solution, the search rotates the patella in
-the direction of the residual moment until the moment changes sign.
+By virtual work, the third equation states that the length of the muscle is stationary among all
+poses that satisfy the first two equations. A stable patella is at a minimum of this length. Near a
+known solution, Newton's method solves the three equations together. Broyden's updates improve the
+Jacobian, whose entries are called slopes. Without a known solution, the search rotates the patella
+in the direction of the residual moment until the moment changes sign.
 """
 
 from collections.abc import Sequence
@@ -53,8 +53,8 @@ class PatellaSearchSettings:
     """m: arm that makes a rotation comparable to a length in Broyden's update. Chosen as half the
     width of a patella."""
     max_distance: float = 5e-3
-    """m: largest distance between a solution and the position at which the button first touches
-    the femur at the same rotation. Chosen because a more distant solution lies behind the femur."""
+    """m: largest distance of a solution from the position where the button first touches the femur
+    at the same rotation. Chosen because a more distant solution lies behind the femur."""
 
 
 PATELLA_SEARCH = PatellaSearchSettings()
@@ -92,10 +92,10 @@ def solve_patella(
     Args:
         mechanism: the extensor mechanism.
         pose_femur_in_insert: pose of the femur link, shape (4, 4).
-        guess: coordinates as initial guess, shape (3,), m and rad; None: all rotations are
-            searched.
+        guess: coordinates as initial guess, shape (3,), m and rad; None: the search covers all
+            rotations.
         slopes: `PatellaState.slopes` at the guess, shape (3, 3); None: unknown.
-        anywhere: whether all rotations are searched if the search from the guess fails.
+        anywhere: whether the search covers all rotations if the search from the guess fails.
 
     Returns:
         The state. Coordinates and forces are NaN unless its status is OK, SEVERAL or EDGE.
@@ -109,13 +109,13 @@ def solve_patella(
             balance = None
     if balance is None:
         if not anywhere:
-            return _nothing(PatellaStatus.MOMENT)
+            return _failed_patella(PatellaStatus.MOMENT)
         try:
             balance, several = search.scan()
         except _Lost as lost:
-            return _nothing(lost.status)
+            return _failed_patella(lost.status)
     if balance.normal_force <= 0.0 or balance.ligament_force <= 0.0:
-        return _nothing(PatellaStatus.PULL)
+        return _failed_patella(PatellaStatus.PULL)
     status = PatellaStatus.SEVERAL if several else PatellaStatus.OK
     if balance.contact.on_edge > 0.5:
         status = PatellaStatus.EDGE
@@ -126,7 +126,7 @@ class _Closing:
     """Newton steps for gap and ligament length at a constant rotation, with Broyden's slopes.
 
     The first slopes are the contact's unit normal and the ligament's direction. On the flanks of
-    the groove the slope of the gap is up to a fifth smaller. Broyden's updates correct this.
+    the groove the slope of the gap is up to a fifth smaller.
     """
 
     def __init__(self, ligament_length: float) -> None:
@@ -136,19 +136,19 @@ class _Closing:
         self.errors: Array = np.full(2, np.inf)
 
     @property
-    def closed(self) -> bool:
+    def converged(self) -> bool:
         return bool(np.abs(self.errors).max() < PATELLA_SEARCH.length_tolerance)
 
     def step(self, balance: PatellaBalance) -> Array:
         """Return the next step (2,) in ap and si, m, limited to 5 mm."""
-        before, stretch = self.errors, balance.ligament.length - self._length
+        last_errors, stretch = self.errors, balance.ligament.length - self._length
         self.errors = np.array([balance.contact.gap, stretch])
-        largest, last = float(np.abs(self.errors).max()), float(np.abs(before).max())
-        learns = largest < 0.5 * last < np.inf
-        if learns:
-            missed = self.errors - before - self._slopes @ self._step
-            self._slopes += np.outer(missed, self._step) / (self._step @ self._step)
-        if not learns or abs(np.linalg.det(self._slopes)) < PATELLA.least_determinant:
+        error, last_error = float(np.abs(self.errors).max()), float(np.abs(last_errors).max())
+        improves = error < 0.5 * last_error < np.inf
+        if improves:
+            update_error = self.errors - last_errors - self._slopes @ self._step
+            self._slopes += np.outer(update_error, self._step) / (self._step @ self._step)
+        if not improves or abs(np.linalg.det(self._slopes)) < PATELLA.least_determinant:
             self._slopes = _slopes_in_plane(balance)
         step = np.linalg.solve(self._slopes, -self.errors)
         self._step = np.asarray(
@@ -164,7 +164,7 @@ class _Search(PatellaFrame):
         """Return the balance with zero gap and the given ligament length at a rotation (rad).
 
         Raises:
-            ComputationError: no such balance exists, or a line ends inside the outline that it
+            ComputationError: there is no such balance, or a line ends inside the outline that it
                 wraps.
         """
         closing = _Closing(self.mechanism.ligament_length)
@@ -172,7 +172,7 @@ class _Search(PatellaFrame):
         for _ in range(40):
             balance = self.balance(coordinates)
             step = closing.step(balance)
-            if closing.closed:
+            if closing.converged:
                 return balance
             coordinates = coordinates + np.append(step, 0.0)
         worst = np.argmax(np.abs(closing.errors))
@@ -195,13 +195,13 @@ class _Search(PatellaFrame):
         current = self.at_rotation(guess, float(guess[2]))
         step = FIRST_STEP
         while abs(current.coordinates[2] - guess[2]) < WIDEST_TURN:
-            turn = current.coordinates[2] + np.sign(current.moment) * step
-            next_balance = self.at_rotation(current.coordinates, float(turn))
+            rotation = current.coordinates[2] + np.sign(current.moment) * step
+            next_balance = self.at_rotation(current.coordinates, float(rotation))
             if next_balance.moment * current.moment <= 0.0:
                 return self.between(current, next_balance)
-            ahead = self._chord(current, next_balance, PATELLA_SEARCH.max_chord_lengths)
-            if ahead is not None:
-                return ahead
+            extrapolated = self._chord(current, next_balance, PATELLA_SEARCH.max_chord_lengths)
+            if extrapolated is not None:
+                return extrapolated
             current, step = next_balance, 1.6 * step
         raise _Lost(PatellaStatus.MOMENT)
 
@@ -221,37 +221,37 @@ class _Search(PatellaFrame):
         try:
             brentq(moment, *ends, xtol=PATELLA_SEARCH.rotation_tolerance, rtol=1e-12)
         except ValueError:
-            # At the rotation of `second`, a search from `first` may find another solution. If its
-            # moment has the sign of the moment at `first`, no zero is bracketed.
+            # At the rotation of `second`, a search from `first` may find another balance. If the
+            # moments of both ends then have the same sign, they do not bracket a zero.
             raise _Lost(PatellaStatus.MOMENT) from None
         return last
 
     def _chord(
-        self, first: PatellaBalance, second: PatellaBalance, reach: float = 1.0
+        self, first: PatellaBalance, second: PatellaBalance, max_lengths: float = 1.0
     ) -> PatellaBalance | None:
         """Return the stable equilibrium near the chord between two balances; None: not found.
 
         Args:
             first: balance at the start of the chord.
             second: balance at the end of the chord.
-            reach: largest distance from the start, in lengths of the chord, 1.
+            max_lengths: largest distance from the start, in lengths of the chord, 1.
         """
         turn = float(second.coordinates[2] - first.coordinates[2])
-        way = (second.coordinates - first.coordinates)[:2] / turn
+        slope_in_plane = (second.coordinates - first.coordinates)[:2] / turn
         slope = (second.moment - first.moment) / turn
         if slope >= 0.0:
             return None
         slopes = np.zeros((3, 3))
         slopes[:2, :2] = _slopes_in_plane(first)
-        slopes[:2, 2], slopes[2, 2] = -slopes[:2, :2] @ way, slope
-        start = first.coordinates + np.append(way, 1.0) * -first.moment / slope
-        span = np.array([min(0.0, reach * turn), max(0.0, reach * turn)])
+        slopes[:2, 2], slopes[2, 2] = -slopes[:2, :2] @ slope_in_plane, slope
+        start = first.coordinates + np.append(slope_in_plane, 1.0) * -first.moment / slope
+        span = np.array([min(0.0, max_lengths * turn), max(0.0, max_lengths * turn)])
         return self._closed_in(start, slopes, span + first.coordinates[2] - start[2])
 
     def _closed_in(
         self, start: Array, slopes: Array, span: Sequence[float]
     ) -> PatellaBalance | None:
-        """Return the stable balance near a pose by Newton's method with Broyden's slopes.
+        """Return the stable equilibrium near a pose by Newton's method with Broyden's slopes.
 
         The result is None if a step leaves the span, if the slopes are those of an unstable state,
         or if the iteration does not converge.
@@ -262,7 +262,7 @@ class _Search(PatellaFrame):
             span: smallest and largest rotation from the start, rad.
         """
         scale = np.array([1.0, 1.0, PATELLA_SEARCH.lever_arm])
-        coordinates, step, before = start, None, np.zeros(3)
+        coordinates, step, last_errors = start, None, np.zeros(3)
         for _ in range(PATELLA_SEARCH.max_evaluations):
             if not span[0] <= coordinates[2] - start[2] <= span[1]:
                 return None
@@ -270,11 +270,11 @@ class _Search(PatellaFrame):
             stretch = balance.ligament.length - self.mechanism.ligament_length
             errors = np.array([balance.contact.gap, stretch, balance.moment])
             if step is not None:
-                missed, scaled = errors - before - slopes @ step, step * scale
-                slopes = slopes + np.outer(missed, scaled * scale) / (scaled @ scaled)
+                update_error, scaled = errors - last_errors - slopes @ step, step * scale
+                slopes = slopes + np.outer(update_error, scaled * scale) / (scaled @ scaled)
             if not _stable(slopes):
                 return None
-            step, before = -np.linalg.solve(slopes, errors), errors
+            step, last_errors = -np.linalg.solve(slopes, errors), errors
             if (
                 np.abs(errors[:2]).max() < PATELLA_SEARCH.length_tolerance
                 and abs(step[2]) < PATELLA_SEARCH.rotation_tolerance
@@ -285,68 +285,80 @@ class _Search(PatellaFrame):
         return None
 
     def scan(self) -> tuple[PatellaBalance, bool]:
-        """Return the stable balance with the shortest muscle, and whether there are several.
+        """Return the stable equilibrium with the shortest muscle, and whether there are several.
 
         Raises:
-            _Lost: there is no stable balance. `status` is the condition that failed in the best
-                attempt.
+            _Lost: there is no stable equilibrium. `status` is the condition that failed last in the
+                order of `_CONDITIONS`.
         """
         flexion = np.arctan2(self.in_insert[1, 0], self.in_insert[0, 0])
-        # The patella rotates with the tibia by about two thirds of the flexion: the scan is centred
-        # at this rotation.
+        # The patella rotates with the tibia by about two thirds of the flexion. This rotation is
+        # the middle of the scan.
         rotations = -0.65 * flexion + np.deg2rad(np.arange(-50.0, 50.1, 10.0))
-        places: list[PatellaBalance | None] = []
-        misses = []
+        candidates: list[PatellaBalance | None] = []
+        failures = []
         for rotation in rotations:
             try:
-                places.append(self.first_touch(float(rotation)))
+                candidates.append(self.first_touch(float(rotation)))
             except ComputationError as error:
-                places.append(None)
-                misses.append(_condition(error))
+                candidates.append(None)
+                failures.append(_condition(error))
         balances = []
-        for first, second in pairwise(places):
+        for first, second in pairwise(candidates):
             # The equilibrium is stable where the moment falls through zero.
             if first and second and first.moment > 0.0 >= second.moment:
                 try:
                     balances.append(self.between(first, second))
                 except ComputationError as error:
-                    misses.append(_condition(error))
+                    failures.append(_condition(error))
         if not balances:
-            misses += [PatellaStatus.MOMENT] * any(places)
-            raise _Lost(max(misses, key=_CONDITIONS.index))
+            failures += [PatellaStatus.MOMENT] * any(candidates)
+            raise _Lost(max(failures, key=_CONDITIONS.index))
         return min(balances, key=lambda b: b.muscle.length), len(balances) > 1
 
     def first_touch(self, rotation: float) -> PatellaBalance:
-        """Return the balance at a rotation (rad), near the first contact of a swinging patella.
+        """Return the balance at a rotation (rad) near first touch.
 
-        The patella swings on its ligament about the tuberosity, from anterior to posterior.
+        The patella swings on its ligament about the tuberosity, from anterior to posterior, until
+        the button touches the femur.
 
         Raises:
             ComputationError: the button does not touch the femur, or there is no balance near the
                 first contact.
         """
-        m = self.mechanism
-        rotated = m.contact.pose(np.array([0.0, 0.0, rotation]))
-        proximal = transform(rotated, m.ligament_proximal)
-        # The ligament has a constant length: its proximal end moves on a circle about the
-        # tuberosity.
-        radius = np.sqrt(max(m.ligament_length**2 - (proximal[2] - self.tuberosity[2]) ** 2, 1e-8))
+        mechanism = self.mechanism
+        rotated = mechanism.contact.pose(np.array([0.0, 0.0, rotation]))
+        proximal = transform(rotated, mechanism.ligament_proximal)
+        # The proximal end of the ligament moves on a circle about the tuberosity.
+        radius = np.sqrt(
+            max(mechanism.ligament_length**2 - (proximal[2] - self.tuberosity[2]) ** 2, 1e-8)
+        )
 
-        def place(lean: float) -> Array:
+        def coordinates_at(lean: float) -> Array:
             swing = self.insert[:2, :2] @ (radius * np.array([np.sin(lean), np.cos(lean)]))
             return np.append(self.tuberosity[:2] + swing - proximal[:2], rotation)
 
         leans = np.deg2rad(np.arange(75.0, -75.1, -5.0))
-        touching = next((k for k, lean in enumerate(leans) if m.contact.touches(place(lean))), 0)
+        touching = next(
+            (k for k, lean in enumerate(leans) if mechanism.contact.touches(coordinates_at(lean))),
+            0,
+        )
         # Index 0: no position touches the femur, or the first position touches it.
         if touching == 0:
             raise _Lost(PatellaStatus.NO_CONTACT)
-        free, deep = leans[touching - 1], leans[touching]
+        separate, touching_lean = leans[touching - 1], leans[touching]
         for _ in range(6):
-            middle = 0.5 * (free + deep)
-            free, deep = (free, middle) if m.contact.touches(place(middle)) else (middle, deep)
-        balance = self.at_rotation(place(free), rotation)
-        if np.linalg.norm((balance.coordinates - place(free))[:2]) > PATELLA_SEARCH.max_distance:
+            middle = 0.5 * (separate + touching_lean)
+            separate, touching_lean = (
+                (separate, middle)
+                if mechanism.contact.touches(coordinates_at(middle))
+                else (middle, touching_lean)
+            )
+        balance = self.at_rotation(coordinates_at(separate), rotation)
+        if (
+            np.linalg.norm((balance.coordinates - coordinates_at(separate))[:2])
+            > PATELLA_SEARCH.max_distance
+        ):
             raise _Lost(PatellaStatus.GAP)
         return balance
 
@@ -358,11 +370,11 @@ _CONDITIONS = (
     PatellaStatus.GAP,
     PatellaStatus.MOMENT,
 )
-"""Conditions in the order of the search's checks. The last condition that failed is reported."""
+"""Conditions in the order of the checks. A failed search reports the last of its conditions."""
 
 
 def _condition(error: ComputationError) -> PatellaStatus:
-    """Return the condition of an error; an error without a status means LINE."""
+    """Return the condition that an error names; LINE if it names none."""
     return error.status if isinstance(error, _Lost) else PatellaStatus.LINE
 
 
@@ -379,6 +391,6 @@ def _stable(slopes: Array) -> bool:
     return bool(slopes[2, 2] < slopes[2, :2] @ np.linalg.solve(plane, slopes[:2, 2]))
 
 
-def _nothing(status: PatellaStatus) -> PatellaState:
-    nan, none = float("nan"), np.full(3, np.nan)
-    return PatellaState(none, none, none, none, nan, nan, nan, nan, nan, status)
+def _failed_patella(status: PatellaStatus) -> PatellaState:
+    nan, unknown = float("nan"), np.full(3, np.nan)
+    return PatellaState(unknown, unknown, unknown, unknown, nan, nan, nan, nan, nan, status)

@@ -5,16 +5,16 @@ fixed to the femur. The patella moves in its sagittal plane (x, y, rotation abou
 
 The articular side of the button is sampled. Sample i has the signed distance d_i from the femoral
 component, the nearest point p_i and the normal n_i at that point. The closest point of two faceted,
-nearly conforming surfaces jumps by centimetres from frame to frame. So the contact is a weighted
-mean over the samples on the left (-z) and on the right side of the patella, with weights
-w_i ~ exp(-d_i/tau):
+nearly conforming surfaces jumps by centimetres from frame to frame. Therefore the contact of the
+left (-z) and of the right side of the patella is a weighted mean over the samples of that side,
+with weights w_i ~ exp(-d_i/tau):
 
     g = sum w_i d_i - tau,    p = sum w_i p_i,    n = sum w_i n_i
 
 For a paraboloid of any curvature, g is exactly the distance of the closest points. A patella in its
-groove touches on both sides. The left side has the share lambda of the force. Soft tissue decides
-this share: per unit contact force, the patella shifts by c times the lateral force and tilts by d
-times the tilting moment:
+groove touches on both sides. The left side carries the share lambda of the force. Soft tissue
+decides this share: per unit contact force, the patella shifts by c times the lateral force and
+tilts by d times the tilting moment:
 
     gap = min over 0 <= lambda <= 1 of
           lambda g_l + (1 - lambda) g_r + (c/2) n_z² + (d/2) a²
@@ -49,8 +49,8 @@ class PatellofemoralSettings:
     of a mesh have about this size."""
     sample_range: float = 14.0 * patch_depth
     """m: excess over the smallest distance above which a sample has no weight. Chosen because the
-    weight at this excess is exp(-14) = 8e-7. The gap of a patch of twenty samples then jumps by
-    3e-11 m."""
+    weight at this excess is exp(-14) = 8e-7: the gap of a patch of twenty samples jumps by 3e-11 m
+    when a sample loses its weight."""
     coarse_samples: int = 60
     """Number of samples of the quick check for touch. Chosen because an initial guess needs no
     more."""
@@ -69,10 +69,10 @@ PATELLOFEMORAL = PatellofemoralSettings()
 
 
 STRAIGHT = 1e-12
-"""m: second derivative of the gap by the share below which the nearer side has the whole force."""
+"""m: second derivative of the gap by lambda below which the nearer side has the whole force."""
 
 FIELDS = 11
-"""Number of values that describe the contact, see `_shared`."""
+"""Number of values that describe the contact, see `_contact_of_sides`."""
 
 EDGE_MARGIN = 0.02
 """1: barycentric distance from a sharp edge below which a point counts as a point of the edge."""
@@ -104,17 +104,16 @@ class PatellarContact:
 class PatellofemoralContact:
     """Contact between button and femoral component, prepared for many positions.
 
-    The distance of a sample changes at most by its displacement. A distance is computed again only
-    if the sample can have a weight at the new position. This saves time and does not change the
-    result.
+    The distance of a sample is computed again only if the sample can have a weight at the new
+    position. The result does not change.
 
     Args:
         femoral: surface of the femoral component in the patellar joint's frame, with shared
             vertices.
         patellar: surface of the button in the patella's frame; its articular side faces -x.
         ml: z of the patella's frame in the joint's frame, m.
-        lateral_yield: c of the module's equation, m.
-        tilt_yield: d of the module's equation, rad/m.
+        lateral_yield: c of the module's equations, m.
+        tilt_yield: d of the module's equations, rad/m.
 
     Raises:
         InputError: the button does not lie on both sides of the sagittal plane.
@@ -128,27 +127,27 @@ class PatellofemoralContact:
         lateral_yield: float = PATELLOFEMORAL.lateral_compliance,
         tilt_yield: float = PATELLOFEMORAL.tilt_compliance,
     ) -> None:
-        self.ml, self._yield = ml, np.array([lateral_yield, tilt_yield])
+        self.ml, self._compliances = ml, np.array([lateral_yield, tilt_yield])
         self._nearest = femoral.nearest
         normals = femoral.corner_normals, femoral.vertex_normals
         self._facets = femoral.triangles, *normals, sharp_edges(femoral)
         self._samples = _joint_side(patellar)
         self._left: NDArray[np.bool_] = np.asarray(self._samples[:, 2] < 0.0)
-        self._forget()
+        self._clear_samples()
 
-    def _forget(self) -> None:
+    def _clear_samples(self) -> None:
         """Drop all stored distances."""
         count = len(self._samples)
-        never, zeros = np.full((count, 3), np.inf), np.zeros(count)
-        places = np.zeros((count, 3)), np.zeros((count, 3))
+        no_position, zeros = np.full((count, 3), np.inf), np.zeros(count)
+        vectors = np.zeros((count, 3)), np.zeros((count, 3))
         # For each sample: position at the last evaluation, distance, nearest point, normal, and
-        # whether the nearest point is on an edge.
-        self._seen = never, zeros, *places, np.zeros(count)
+        # whether the nearest point is on a sharp or open edge.
+        self._stored = no_position, zeros, *vectors, np.zeros(count)
 
     def unused(self) -> "PatellofemoralContact":
         """Return the same contact without stored distances."""
         other = copy.copy(self)
-        other._forget()
+        other._clear_samples()
         return other
 
     def pose(self, coordinates: Array) -> Array:
@@ -164,7 +163,7 @@ class PatellofemoralContact:
             ComputationError: the force has no sagittal part.
         """
         contact = np.empty(FIELDS)
-        length = _shared(self._sides_at(coordinates), self.ml, self._yield, contact)
+        length = _contact_of_sides(self._sides_at(coordinates), self.ml, self._compliances, contact)
         if length < PATELLOFEMORAL.least_sagittal_part:
             raise ComputationError("the femur pushes the patella straight sideways")
         gap, left_share, shift, tilt, on_edge = contact[:5].tolist()
@@ -172,130 +171,136 @@ class PatellofemoralContact:
 
     def touches(self, coordinates: Array) -> bool:
         """Return whether any of a few samples lies inside the femur, as a quick check."""
-        few = self._samples[:: max(1, len(self._samples) // PATELLOFEMORAL.coarse_samples)]
-        samples = transform(self.pose(np.asarray(coordinates, float)), few)
+        subset = self._samples[:: max(1, len(self._samples) // PATELLOFEMORAL.coarse_samples)]
+        samples = transform(self.pose(np.asarray(coordinates, float)), subset)
         low, high = self._nearest.surface.bounds
         # A sample outside the femur's box cannot lie inside the femur.
         samples = samples[((samples >= low) & (samples <= high)).all(axis=1)]
-        near = self._nearest.at(samples)
-        apart = np.einsum("ij,ij->i", samples - near.points, near.normals)
-        return bool((apart < 0.0).any())
+        nearest = self._nearest.at(samples)
+        heights = np.einsum("ij,ij->i", samples - nearest.points, nearest.normals)
+        return bool((heights < 0.0).any())
 
     def _sides_at(self, coordinates: Array) -> Array:
         """Return gap, point, normal and share on edges of the left and the right side (2, 8)."""
         samples = transform(self.pose(np.asarray(coordinates, float)), self._samples)
-        seen_at, distance = self._seen[:2]
-        which = _which_matter(samples, self._left, PATELLOFEMORAL.sample_range, seen_at, distance)
-        if len(which):
-            nearest = self._nearest.at(samples[which])
-            _take(
-                which,
+        last_position, distance = self._stored[:2]
+        indices = _samples_to_update(
+            samples, self._left, PATELLOFEMORAL.sample_range, last_position, distance
+        )
+        if len(indices):
+            nearest = self._nearest.at(samples[indices])
+            _store_samples(
+                indices,
                 samples,
                 nearest.distance,
                 nearest.faces,
                 nearest.weights,
                 *self._facets,
-                *self._seen,
+                *self._stored,
             )
         sides = np.empty((2, 8))
         _mean_over_sides(
             self._left,
             PATELLOFEMORAL.patch_depth,
             PATELLOFEMORAL.sample_range,
-            *self._seen[1:],
+            *self._stored[1:],
             sides,
         )
         return sides
 
 
 @compiled_as_written
-def _which_matter(
-    samples: Array, on_left: NDArray[np.bool_], reach: float, seen_at: Array, distance: Array
+def _samples_to_update(
+    samples: Array,
+    on_left: NDArray[np.bool_],
+    sample_range: float,
+    last_position: Array,
+    distance: Array,
 ) -> Index:
-    """Return the samples whose distances must be computed again.
+    """Return the indices of the samples whose distances must be computed again.
 
     Let d be the distance of a sample at its last evaluation, and m its displacement since then. The
-    present distance is between d - m and d + m. These bounds exclude samples without weight.
+    new distance is between d - m and d + m. These bounds exclude samples without weight.
 
     Args:
         samples: present positions of the samples, shape (n, 3), m.
         on_left: whether each sample is on the -z side, shape (n,).
-        reach: excess over the smallest distance above which a sample has no weight, m.
-        seen_at: position of each sample at its last evaluation, shape (n, 3), m; inf: no
+        sample_range: excess over the smallest distance above which a sample has no weight, m.
+        last_position: position of each sample at its last evaluation, shape (n, 3), m; inf: no
             evaluation.
         distance: signed distance at that position, shape (n,), m.
     """
     count, nearest = len(samples), np.full(2, np.inf)
-    displacement, which, number = np.full(count, np.inf), np.empty(count, np.int64), 0
+    displacement, indices, number = np.full(count, np.inf), np.empty(count, np.int64), 0
     for n in range(count):
-        if seen_at[n, 0] < np.inf:
-            displacement[n] = np.sqrt(np.sum((samples[n] - seen_at[n]) ** 2))
+        if last_position[n, 0] < np.inf:
+            displacement[n] = np.sqrt(np.sum((samples[n] - last_position[n]) ** 2))
             side = 0 if on_left[n] else 1
             # Upper bound of the smallest distance on this side.
             nearest[side] = min(nearest[side], distance[n] + displacement[n])
     for n in range(count):
-        # True: even the lower bound of this sample's distance is too large for a weight.
-        beyond = distance[n] - displacement[n] >= nearest[0 if on_left[n] else 1] + reach
-        if displacement[n] != 0.0 and not beyond:  # true for NaN, too
-            which[number] = n
+        # Even the lower bound of the distance of an excluded sample is too large for a weight.
+        excluded = distance[n] - displacement[n] >= nearest[0 if on_left[n] else 1] + sample_range
+        if displacement[n] != 0.0 and not excluded:  # true for NaN, too
+            indices[number] = n
             number += 1
-    return which[:number]
+    return indices[:number]
 
 
 @compiled_as_written
-def _take(
-    which: Index,
+def _store_samples(
+    indices: Index,
     samples: Array,
-    apart: Array,
+    unsigned: Array,
     faces: Index,
     weights: Array,
     triangles: Array,
     smooth_normals: Array,
     vertex_normals: Array,
     sharp: NDArray[np.bool_],
-    seen_at: Array,
+    last_position: Array,
     distance: Array,
-    foot: Array,
+    nearest_point: Array,
     normal: Array,
     on_edge: Array,
 ) -> None:
     """Store the distances, nearest points and normals of samples.
 
     Args:
-        which: indices of m samples, shape (m,).
+        indices: indices of m samples, shape (m,).
         samples: positions of all samples, shape (n, 3), m.
-        apart: unsigned distances of the m samples, shape (m,), m.
+        unsigned: unsigned distances of the m samples, shape (m,), m.
         faces: triangle of each nearest point, shape (m,).
         weights: barycentric coordinates of each nearest point, shape (m, 3).
         triangles: triangles of the femoral component, shape (k, 3, 3), m.
         smooth_normals: unit normals at the corners, shape (k, 3, 3). They jump at sharp edges.
         vertex_normals: unit normals at the corners, means over each vertex, shape (k, 3, 3).
         sharp: whether the edge opposite each corner is sharp or open, shape (k, 3).
-        seen_at: output: positions of the samples, shape (n, 3), m.
+        last_position: output: positions of the samples, shape (n, 3), m.
         distance: output: signed distances, shape (n,), m.
-        foot: output: nearest points, shape (n, 3), m.
+        nearest_point: output: nearest points, shape (n, 3), m.
         normal: output: unit normals at the nearest points, shape (n, 3).
         on_edge: output: 1 if the nearest point is on a sharp or open edge, else 0, shape (n,).
     """
     outward = np.empty(3)
-    for m in range(len(which)):
-        n, face, edge = which[m], faces[m], False
+    for m in range(len(indices)):
+        n, face, edge = indices[m], faces[m], False
         for corner in range(3):
             edge |= sharp[face, corner] and weights[m, corner] < EDGE_MARGIN
-        # Vertex normals change across a sharp edge without a jump.
+        # Vertex normals do not jump across a sharp edge.
         normals = vertex_normals[face] if edge else smooth_normals[face]
-        along, length = 0.0, 0.0
+        height, length = 0.0, 0.0
         for k in range(3):
-            foot[n, k], outward[k], seen_at[n, k] = 0.0, 0.0, samples[n, k]
+            nearest_point[n, k], outward[k], last_position[n, k] = 0.0, 0.0, samples[n, k]
             for corner in range(3):
-                foot[n, k] += weights[m, corner] * triangles[face, corner, k]
+                nearest_point[n, k] += weights[m, corner] * triangles[face, corner, k]
                 outward[k] += weights[m, corner] * normals[corner, k]
-            along += (samples[n, k] - foot[n, k]) * outward[k]
+            height += (samples[n, k] - nearest_point[n, k]) * outward[k]
             length += outward[k] ** 2
         for k in range(3):
             normal[n, k] = outward[k] / np.sqrt(length)
         # A sample behind the surface is inside the femur: its distance is negative.
-        distance[n] = -apart[m] if along < 0.0 else apart[m]
+        distance[n] = -unsigned[m] if height < 0.0 else unsigned[m]
         on_edge[n] = 1.0 if edge else 0.0
 
 
@@ -303,9 +308,9 @@ def _take(
 def _mean_over_sides(
     on_left: NDArray[np.bool_],
     depth: float,
-    reach: float,
+    sample_range: float,
     distance: Array,
-    foot: Array,
+    nearest_point: Array,
     normal: Array,
     on_edge: Array,
     means: Array,
@@ -314,10 +319,10 @@ def _mean_over_sides(
 
     Args:
         on_left: whether each sample is on the -z side, shape (n,).
-        depth: tau of the module's equation, m.
-        reach: excess over the smallest distance above which a sample has no weight, m.
+        depth: tau of the module's equations, m.
+        sample_range: excess over the smallest distance above which a sample has no weight, m.
         distance: signed distances, shape (n,), m.
-        foot: nearest points, shape (n, 3), m.
+        nearest_point: nearest points, shape (n, 3), m.
         normal: unit normals at the nearest points, shape (n, 3).
         on_edge: 1 if the nearest point is on a sharp or open edge, else 0, shape (n,).
         means: output: the means of each side, shape (2, 8).
@@ -329,16 +334,16 @@ def _mean_over_sides(
                 nearest = min(nearest, distance[n])
         means[side] = 0.0
         for n in range(len(on_left)):
-            behind = distance[n] - nearest
-            if on_left[n] != (side == 0) or behind >= reach:
+            excess = distance[n] - nearest
+            if on_left[n] != (side == 0) or excess >= sample_range:
                 continue
             # Boltzmann weights relative to the nearest sample, so that no exponential overflows.
-            weight = np.exp(-behind / depth)
+            weight = np.exp(-excess / depth)
             total += weight
             means[side, 0] += weight * distance[n]
             means[side, 7] += weight * on_edge[n]
             for k in range(3):
-                means[side, 1 + k] += weight * foot[n, k]
+                means[side, 1 + k] += weight * nearest_point[n, k]
                 means[side, 4 + k] += weight * normal[n, k]
         means[side] /= total
         # The weighted mean over a paraboloid exceeds its smallest distance by tau.
@@ -346,13 +351,13 @@ def _mean_over_sides(
 
 
 @compiled_as_written
-def _shared(sides: Array, middle: float, yields: Array, contact: Array) -> float:
-    """Compute the contact by the module's equation, and return the normal's sagittal part.
+def _contact_of_sides(sides: Array, middle: float, compliances: Array, contact: Array) -> float:
+    """Compute the contact by the module's equations, and return the normal's sagittal part.
 
     Args:
         sides: gap, point, normal and share on edges of the left and the right side, shape (2, 8).
         middle: z of the patella's middle, m.
-        yields: c and d of the module's equation, shape (2,).
+        compliances: c (m) and d (rad/m) of the module's equations, shape (2,).
         contact: output: gap, share of the left, shift, tilt, share on edges, point (3,) and normal
             (3,) of the line of action in the sagittal plane, shape (`FIELDS`,).
     """
@@ -360,10 +365,10 @@ def _shared(sides: Array, middle: float, yields: Array, contact: Array) -> float
     # equilibrium.
     curvature, slope = 0.0, sides[0, 0] - sides[1, 0]
     for k in range(2):
-        at, offset = (6, 0.0) if k == 0 else (3, middle)
-        change = sides[0, at] - sides[1, at]
-        curvature += yields[k] * change * change
-        slope += yields[k] * change * (sides[1, at] - offset)
+        component, offset = (6, 0.0) if k == 0 else (3, middle)
+        change = sides[0, component] - sides[1, component]
+        curvature += compliances[k] * change * change
+        slope += compliances[k] * change * (sides[1, component] - offset)
     if curvature < STRAIGHT:
         left_share = 1.0 if sides[0, 0] < sides[1, 0] else 0.0
     else:
@@ -372,16 +377,16 @@ def _shared(sides: Array, middle: float, yields: Array, contact: Array) -> float
     mean = left_share * sides[0] + (1.0 - left_share) * sides[1]
     moment, length = 0.0, np.sqrt(mean[4] ** 2 + mean[5] ** 2)
     for side in range(2):
-        part = left_share if side == 0 else 1.0 - left_share
-        moment += (sides[side, 1] - mean[1]) * part * sides[side, 5]
-        moment -= (sides[side, 2] - mean[2]) * part * sides[side, 4]
+        side_share = left_share if side == 0 else 1.0 - left_share
+        moment += (sides[side, 1] - mean[1]) * side_share * sides[side, 5]
+        moment -= (sides[side, 2] - mean[2]) * side_share * sides[side, 4]
     # Lateral part of the normal, and lever arm of the force about the middle.
-    aside, lever = mean[6], mean[3] - middle
-    contact[0] = mean[0] + 0.5 * (yields[0] * aside**2 + yields[1] * lever**2)
+    lateral, lever = mean[6], mean[3] - middle
+    contact[0] = mean[0] + 0.5 * (compliances[0] * lateral**2 + compliances[1] * lever**2)
     contact[1], contact[2], contact[3], contact[4] = (
         left_share,
-        yields[0] * aside,
-        yields[1] * lever,
+        compliances[0] * lateral,
+        compliances[1] * lever,
         mean[7],
     )
     # Projection of the mean point onto the line of action, in the sagittal plane.

@@ -1,20 +1,19 @@
 """Relaxation of the muscle forces between the passes of a search for equilibrium.
 
 The muscle forces depend on the knee's equilibrium, and the equilibrium depends on the muscle
-forces. Under a light load the knee is compliant, and an alternating computation would oscillate.
-Each pass therefore changes the applied forces f by a part omega of the difference from the required
-forces f',
+forces. Under a light load the knee is compliant, and a plain iteration between the two would
+oscillate. Each pass therefore changes the applied forces f by a share omega of the difference from
+the required forces f',
 
     f <- f + omega (f' - f),   omega <- -omega d . (d' - d) / |d' - d|²,
 
-where d and d' are the last two differences f' - f (Aitken's secant for a vector). At the end
-f = f'.
+where d and d' are the last two differences f' - f (Aitken's secant for a vector).
 
 The moment arms of the muscles depend on the compliance of the knee, and the compliance depends on
 the equilibrium. The first passes use the measured compliance. Later passes change the compliance by
-half of its difference from the measured value, then by a quarter. So the compliance converges even
-if the contact's stiffness changes fast with the pose. After these passes it stays constant. `doubt`
-is the remaining difference.
+half of its difference from the measured value, then by a quarter. The compliance then converges
+even if the contact's stiffness changes fast with the pose. After these passes the compliance stays
+constant, and `compliance_error` is the remaining relative difference.
 
 References: Irons & Tuck, Int J Numer Methods Eng 1:275 (1969), doi:10.1002/nme.1620010306;
 Küttler & Wall, Comput Mech 43:61 (2008), doi:10.1007/s00466-008-0255-5.
@@ -53,65 +52,71 @@ difference from the measured compliance."""
 TURNS = np.array(
     [1.0, 1.0, 1.0, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm]
 )
-"""1 and m: factors that make the responses to forces and moments comparable."""
+"""1 and m: factors that make the compliances to forces and moments comparable."""
 
 
 class Relaxation:
     """The muscles' forces over the passes of one search.
 
     Attributes:
-        settled: whether the applied forces have converged to the required forces.
-        doubt: relative difference of the measured compliance from the compliance in use.
+        converged: whether the applied forces have converged to the required forces.
+        compliance_error: relative difference of the measured compliance from the compliance in use.
     """
 
     def __init__(self) -> None:
-        self._held: MuscleShare | None = None
-        self._last: Array | None = None
-        self._part, self.settled = MOST, True
-        self._yields: Array | None = None
-        self._passes, self.doubt = 0, 0.0
+        self._applied: MuscleShare | None = None
+        self._last_difference: Array | None = None
+        self._factor, self.converged = MOST, True
+        self._compliance: Array | None = None
+        self._passes, self.compliance_error = 0, 0.0
 
-    def yielding(self, measured: Array | None) -> Array | None:
-        """Return the compliance of the knee for the next pass.
+    def compliance(self, measured: Array | None) -> Array | None:
+        """Return the compliance of the knee, 1 and 1/m, for the next pass.
 
         Args:
             measured: compliance at the last equilibrium, from `ReleasedForces.tension_per_wrench`,
                 shape (6,); None: unknown.
         """
-        self._passes, self.doubt = self._passes + 1, 0.0
-        last, self._yields = self._yields, measured
+        self._passes, self.compliance_error = self._passes + 1, 0.0
+        last_compliance, self._compliance = self._compliance, measured
         step = next((part for until, part in STEPS if self._passes <= until), 0.0)
-        if last is None or measured is None or step == 1.0:
+        if last_compliance is None or measured is None or step == 1.0:
             return measured
-        relaxed = last + step * (measured - last)
-        away, size = (float(np.linalg.norm(part * TURNS)) for part in (measured - relaxed, relaxed))
-        if away > 0.0:
-            self.doubt = away / size if size > 0.0 else np.inf
-        self._yields = relaxed
+        relaxed = last_compliance + step * (measured - last_compliance)
+        difference, size = (
+            float(np.linalg.norm(part * TURNS)) for part in (measured - relaxed, relaxed)
+        )
+        if difference > 0.0:
+            self.compliance_error = difference / size if size > 0.0 else np.inf
+        self._compliance = relaxed
         return relaxed
 
-    def mixed(self, required: "MuscleShare") -> "MuscleShare":
+    def relaxed_forces(self, required: "MuscleShare") -> "MuscleShare":
         """Return the forces of the next pass.
 
         Args:
             required: muscle forces at the equilibrium of the last pass.
         """
-        applied, self._held, self.settled = self._held, required, False
+        applied, self._applied, self.converged = self._applied, required, False
         if applied is None:
             return required
-        away = required.force - applied.force
-        if self._last is not None:
-            change = away - self._last
-            part = -self._part * float(self._last @ change) / max(float(change @ change), 1e-12)
-            self._part = float(np.clip(part, LEAST, MOST))
-        self._last = away
-        self.settled = bool(np.abs(away).max() < MUSCLE_ITERATION.muscle_force_tolerance)
-        if not self.settled:
-            self._held = replace(
+        difference = required.force - applied.force
+        if self._last_difference is not None:
+            change = difference - self._last_difference
+            factor = (
+                -self._factor
+                * float(self._last_difference @ change)
+                / max(float(change @ change), 1e-12)
+            )
+            self._factor = float(np.clip(factor, LEAST, MOST))
+        self._last_difference = difference
+        self.converged = bool(np.abs(difference).max() < MUSCLE_ITERATION.muscle_force_tolerance)
+        if not self.converged:
+            self._applied = replace(
                 required,
                 activation=applied.activation
-                + self._part * (required.activation - applied.activation),
-                force=applied.force + self._part * away,
-                reserve=applied.reserve + self._part * (required.reserve - applied.reserve),
+                + self._factor * (required.activation - applied.activation),
+                force=applied.force + self._factor * difference,
+                reserve=applied.reserve + self._factor * (required.reserve - applied.reserve),
             )
-        return self._held
+        return self._applied

@@ -3,16 +3,16 @@
 Flexion keeps its recorded value. Equilibrium with the contact always determines the
 superior-inferior position. It also determines adduction, axial rotation, anterior-posterior and
 medial-lateral position if the scene releases them. A coordinate that is not released keeps its
-recorded value. The force or moment that this requires is a residual of the equations of motion.
+recorded value. The force or moment that holds it is a residual of the equations of motion.
 
 The search is repeated in passes. Within one pass the patella is fixed to the femur, and the forces
 of the other muscles are constant. Then patella, lines and muscle forces are computed again at the
-new pose and contact. The passes end when the knee does not move between them. The tension of the
+new pose and contact. The passes end when the knee no longer moves between them. The tension of the
 extensor group then satisfies the knee's equations.
 
 Inertia and sliding speed use the recorded rates: the released coordinates are quasi-static. Coulomb
-friction is mu times the resultant of each condyle, opposite to the recorded sliding, on the line of
-action of the resultant.
+friction is mu times the resultant of each condyle. It is opposite to the recorded sliding and acts
+where the resultant acts.
 """
 
 from collections.abc import Sequence
@@ -46,15 +46,15 @@ class ReleasedKneeSettings:
     """Tolerances and limits of the passes between knee, patella and muscles."""
 
     knee_tolerance: float = 2e-6
-    """m: movement of the knee between passes below which they have converged. Chosen equal to the
-    step tolerance of the search."""
+    """m: movement of the knee between passes below which the passes have converged. Chosen equal to
+    the step tolerance of the search."""
     contact_force_tolerance: float = 0.1
     """N: change of the contact force below which passes have converged, or `contact_force_share` of
     the force if that is larger. Chosen as a ten-thousandth of a usual contact force."""
     residual_tolerance: float = 0.5
     """N (moments are divided by the lever arm): largest residual force on a released coordinate,
     with patella, lines and contact of the returned pose. A frame has no result if the residual
-    exceeds the largest of this tolerance, `residual_share` of the contact force, and the error of
+    exceeds three limits: this tolerance, `residual_share` of the contact force, and the error of
     the contact force. Chosen because measured residuals are below 0.1 N."""
     residual_share: float = 1e-3
     """1: see `residual_tolerance`. Chosen because the facets of the patella change the force by a
@@ -65,17 +65,17 @@ class ReleasedKneeSettings:
     max_passes: int = 24
     """Maximum number of passes. Chosen because a pass halves the change of a compliant knee."""
     inner_tolerance_share: float = 0.1
-    """1: remaining step of a pass with muscles, as a share of its movement, at which the pass ends.
-    Chosen because more passes follow in any case."""
+    """1: remaining step of a pass with muscles, as a share of the knee's movement in this pass, at
+    which the pass ends. Chosen because more passes follow in any case."""
     muscle_force_range: float = 3e-3
-    """m: distance from the initial guess within which the muscle forces of the last frame are a
-    good guess. Chosen because the knee moves by less from frame to frame."""
+    """m: distance from the initial guess at which a pass ends if the last frame gave the muscle
+    forces. Chosen because the knee moves by less from frame to frame."""
     slack_force: float = 1e-3
     """N: an extensor group with a smaller tension is slack. Chosen because it is far below the
     resolution of the reports."""
     initial_load_error: float = 0.5
-    """1: largest relative difference between the load at an initial guess and the load of the last
-    frame. Chosen because the search converges from such a guess."""
+    """1: largest relative difference between the load at a guess and the load of the last frame.
+    Chosen because the search converges from such a guess."""
     max_height_steps: int = 4
     """Maximum number of heights that are tried to bring the load within `initial_load_error`.
     Chosen because each height costs one evaluation of the contact."""
@@ -97,10 +97,10 @@ class KneeEquilibrium:
         contact: the contact at these coordinates.
         balance: result of the last pass.
         passes: number of passes.
-        trials: number of evaluations of the contact.
+        trials: number of evaluations of the contact in all passes.
         change: change of the contact force in the last pass, N.
         problem: reason why the search failed; empty: it succeeded.
-        doubt: `Relaxation.doubt` at the end.
+        compliance_error: `Relaxation.compliance_error` at the end.
         residual: largest residual force on a released coordinate with patella, lines and contact of
             the returned pose, N (moments divided by the lever arm); inf: not measured.
         second: description of a second equilibrium from another initial guess (`InitialPoses`);
@@ -116,7 +116,7 @@ class KneeEquilibrium:
     trials: int
     change: float
     problem: str
-    doubt: float = 0.0
+    compliance_error: float = 0.0
     residual: float = np.inf
     second: str = ""
 
@@ -162,46 +162,62 @@ class ReleasedKnee:
         Raises:
             ComputationError: no muscle forces balance the frame.
         """
-        place, middle, force = np.array(start, float), np.array(start[:3]), np.full(3, np.nan)
-        # `slack` is reset in every frame: a ligament that was slack in the last frame may pull now.
+        coordinates, middle, force = np.array(start, float), np.array(start[:3]), np.full(3, np.nan)
+        # Every frame begins with a taut ligament, even if the ligament was slack in the last frame.
         knee, slack, trials, passes = before, False, 0, 0
-        touch, mixing, ways = None, Relaxation(), [np.inf, np.inf]
+        last_contact, relaxation, distances = None, Relaxation(), [np.inf, np.inf]
         if instant.muscles and before:
-            place, touch = self._carrying(place, before.contact)
-        # The muscle forces of the last frame are a good guess only near a contact of that load.
-        reach = RELEASED_KNEE.muscle_force_range if touch else np.inf
+            coordinates, last_contact = self._at_load(coordinates, before.contact)
+        # The muscle forces of the last frame are a good guess only near the pose of their contact.
+        stop_distance = RELEASED_KNEE.muscle_force_range if last_contact else np.inf
         while passes < RELEASED_KNEE.max_passes:
-            knee, pushes = self._pass(instant, place, middle, slack, knee, touch, mixing, reach)
-            touch = knee.contact
+            knee, pushes = self._pass(
+                instant, coordinates, middle, slack, knee, last_contact, relaxation, stop_distance
+            )
+            last_contact = knee.contact
             passes, trials = passes + 1, trials + knee.balance.trials
             change = float(np.linalg.norm(knee.contact.wrench[:3] - force))
             knee = replace(knee, passes=passes, trials=trials, change=change)
-            travel = np.abs((knee.coordinates - place) * SCALE).max()
-            place, force, last = knee.coordinates, knee.contact.wrench[:3], middle
-            middle = _middle(knee.contact, points, place)
-            ways.append(max(travel, np.abs(middle - last).max() if self._keeps else 0.0))
+            travel = np.abs((knee.coordinates - coordinates) * SCALE).max()
+            coordinates, force, last_middle = knee.coordinates, knee.contact.wrench[:3], middle
+            middle = _middle(knee.contact, points, coordinates)
+            distances.append(
+                max(
+                    travel, np.abs(middle - last_middle).max() if self._has_residual_forces else 0.0
+                )
+            )
             if pushes:
-                # The patellar ligament cannot push: the search begins again without its force.
-                slack, knee, touch = True, before, None
-                place, middle, force = np.array(start, float), np.array(start[:3]), force * np.nan
-                ways = [np.inf, np.inf]
+                # The patellar ligament cannot push: the search begins again with a slack ligament.
+                slack, knee, last_contact = True, before, None
+                coordinates, middle, force = (
+                    np.array(start, float),
+                    np.array(start[:3]),
+                    force * np.nan,
+                )
+                distances = [np.inf, np.inf]
             elif knee.problem or (
-                mixing.settled
-                and knee.balance.at_rest
-                and ahead(ways[-3:]) * ways[-1] < RELEASED_KNEE.knee_tolerance
-                and ahead(ways[-3:]) * change
+                relaxation.converged
+                and knee.balance.converged
+                and remaining_distance(distances[-3:]) * distances[-1]
+                < RELEASED_KNEE.knee_tolerance
+                and remaining_distance(distances[-3:]) * change
                 < max(
                     RELEASED_KNEE.contact_force_tolerance,
                     RELEASED_KNEE.contact_force_share * float(np.linalg.norm(force)),
                 )
             ):
-                knee = self._measured(instant, replace(knee, doubt=mixing.doubt), middle, slack)
-                if knee.problem or knee.residual <= self._allowed(knee.contact):
+                knee = self._measured(
+                    instant,
+                    replace(knee, compliance_error=relaxation.compliance_error),
+                    middle,
+                    slack,
+                )
+                if knee.problem or knee.residual <= self._residual_limit(knee.contact):
                     return knee
         assert knee is not None
         return replace(knee, problem="the iteration between knee and patella does not converge")
 
-    def _allowed(self, contact: "ProbedContact") -> float:
+    def _residual_limit(self, contact: "ProbedContact") -> float:
         """Return the residual (N) below which a frame has converged."""
         share = max(RELEASED_KNEE.residual_share, contact.accuracy)
         force = float(np.linalg.norm(contact.wrench[:3]))
@@ -225,66 +241,68 @@ class ReleasedKnee:
         problem = "; ".join(geometry.problems)
         return replace(knee, geometry=geometry, patella=patella, residual=residual, problem=problem)
 
-    def _carrying(
-        self, place: Array, like: "ProbedContact"
+    def _at_load(
+        self, coordinates: Array, target: "ProbedContact"
     ) -> "tuple[Array, ProbedContact | None]":
-        """Return coordinates raised or lowered until the load is about that of another contact.
+        """Return coordinates with the height changed until the load is about that of a contact.
 
         Returns:
             Coordinates (6,), and the contact at these coordinates. The contact is None if other
-            condyles carry the load, if it has no tangent, or if the load is not reached.
+            condyles carry the load, if the model gives no tangent, or if the load is not reached.
         """
-        load = float(like.wrench[1])
+        load = float(target.wrench[1])
         for _ in range(RELEASED_KNEE.max_height_steps):
-            contact = self._probe.at(knee_pose(place))
+            contact = self._probe.at(knee_pose(coordinates))
             if (
                 not contact.tangent
                 or not contact.condyles
-                or set(contact.condyles) != set(like.condyles)
+                or set(contact.condyles) != set(target.condyles)
             ):
                 break
-            more = float(contact.wrench[1]) - load
-            if abs(more) < RELEASED_KNEE.initial_load_error * abs(load):
-                return place, contact
-            twist = knee_axes(place)[SUPERIOR]
+            excess = float(contact.wrench[1]) - load
+            if abs(excess) < RELEASED_KNEE.initial_load_error * abs(load):
+                return coordinates, contact
+            twist = knee_axes(coordinates)[SUPERIOR]
             slope = sum(
                 float(c.stiffness[1] @ twist) for c in contact.loads if c.stiffness is not None
             )
             if not slope > 0.0:
                 break
-            place = place.copy()
-            place[SUPERIOR] -= more / slope
-        return place, None
+            coordinates = coordinates.copy()
+            coordinates[SUPERIOR] -= excess / slope
+        return coordinates, None
 
     def _pass(
         self,
         instant: Instant,
-        place: Array,
+        coordinates: Array,
         middle: Array,
         slack: bool,
         before: KneeEquilibrium | None,
-        touch: "ProbedContact | None",
-        mixing: Relaxation,
-        reach: float,
+        last_contact: "ProbedContact | None",
+        relaxation: Relaxation,
+        stop_distance: float,
     ) -> tuple[KneeEquilibrium, bool]:
         """Return the equilibrium of one pass, and whether the patellar ligament would push."""
         patella, guess = None, before.patella if before else None
         if instant.extensor is not None:
-            patella = instant.extensor.patella(knee_pose(place), guess)
-        geometry = instant.geometry(place, patella)
+            patella = instant.extensor.patella(knee_pose(coordinates), guess)
+        geometry = instant.geometry(coordinates, patella)
         joint = self._joint(instant, geometry, middle, slack)
         muscles = instant.muscles
         if muscles is not None and not geometry.problems:
-            applied = None if touch is None or before is None else before.geometry.share
+            applied = None if last_contact is None or before is None else before.geometry.share
             applied = None if applied is None else muscles.at(applied)
-            share = mixing.mixed(self._share(instant, geometry, joint, touch, applied, mixing))
+            share = relaxation.relaxed_forces(
+                self._share(instant, geometry, joint, last_contact, applied, relaxation)
+            )
             geometry, joint = replace(geometry, share=share), replace(joint, share=share)
             if slack := muscles.tension(share) < RELEASED_KNEE.slack_force:
                 joint = self._joint(instant, geometry, middle, slack)
-        forces = self._forces(instant, joint, place, touch)
+        forces = self._forces(instant, joint, coordinates, last_contact)
         stiffness = before.balance.stiffness if before else None
         balance = forces.balance(
-            stiffness, *((RELEASED_KNEE.inner_tolerance_share, reach) if muscles else ())
+            stiffness, *((RELEASED_KNEE.inner_tolerance_share, stop_distance) if muscles else ())
         )
         contact, problem = forces.contact(balance), "; ".join(geometry.problems)
         if balance.status is not BalanceStatus.OK:
@@ -303,7 +321,7 @@ class ReleasedKnee:
             problem,
         )
         # With other muscles, static optimisation decides whether the quadriceps is slack.
-        ended = balance.at_rest or balance.status is not BalanceStatus.OK
+        ended = balance.converged or balance.status is not BalanceStatus.OK
         return knee, ended and not muscles and contact.known and forces.pushes(balance)
 
     def _share(
@@ -311,97 +329,105 @@ class ReleasedKnee:
         instant: Instant,
         geometry: KneeGeometry,
         joint: JointEquilibrium,
-        touch: "ProbedContact | None",
+        last_contact: "ProbedContact | None",
         applied: "MuscleShare | None",
-        mixing: Relaxation,
+        relaxation: Relaxation,
     ) -> "MuscleShare":
         """Return the force of each muscle if the released coordinates depend on these forces.
 
-        If no equilibrium is known yet, or if the contact has no tangent, the contact points are
-        constant. If the equations are then singular, the contact force acts at the femoral origin.
+        The contact points are constant if no equilibrium is known yet, or if the contact has no
+        tangent. If the equations are then singular, the contact force acts at the femoral origin.
 
         Args:
             instant: the knee at one instant.
             geometry: input of the equations, without the contact.
             joint: equations of the released coordinates with a taut extensor mechanism.
-            touch: the contact at this pose; None: no contact with the load of the last frame is
-                known.
+            last_contact: the contact at this pose; None: no contact with about the load of the last
+                frame is known.
             applied: muscle forces of the last pass, in this frame or the previous frame.
-            mixing: relaxation of forces and compliance.
+            relaxation: relaxation of forces and compliance.
 
         Raises:
             ComputationError: no muscle forces balance the frame.
         """
-        place, muscles, friction = geometry.coordinates, instant.muscles, instant.friction
+        coordinates, muscles, friction = geometry.coordinates, instant.muscles, instant.friction
         assert muscles is not None
-        contact = self._probe.at(knee_pose(place)) if touch is None else touch
-        gain = None
+        contact = self._probe.at(knee_pose(coordinates)) if last_contact is None else last_contact
+        compliance = None
         if applied is not None:
-            forces = self._forces(instant, replace(joint, share=applied), place)
-            smooth = self._probe.smoothed(knee_pose(place), contact)
-            gain = mixing.yielding(forces.tension_per_wrench(smooth))
-        if applied is not None and gain is not None:
-            pull = applied.wrench(geometry.state.pose("tibia"), geometry.state.pose("femur"))
-            base = forces.tension_at_rest(contact, gain) - float(gain @ pull)
-            share = muscles.share_of_yielding_knee(geometry, base, gain)
+            forces = self._forces(instant, replace(joint, share=applied), coordinates)
+            smooth = self._probe.smoothed(knee_pose(coordinates), contact)
+            compliance = relaxation.compliance(forces.tension_per_wrench(smooth))
+        if applied is not None and compliance is not None:
+            muscle_wrench = applied.wrench(
+                geometry.state.pose("tibia"), geometry.state.pose("femur")
+            )
+            base = forces.tension_in_equilibrium(contact, compliance) - float(
+                compliance @ muscle_wrench
+            )
+            share = muscles.share_of_yielding_knee(geometry, base, compliance)
         else:
-            points = instant.resultants(place, contact.condyles)
-            geometry = replace(geometry, post=instant.post_loads(place, contact.post))
-            off = frozenset(instant.sides - set(points)) if points else frozenset[str]()
-            share = muscles.share(replace(geometry, condyles=points), friction, off)
-            if touch is None and share.status != "ok":
+            points = instant.resultants(coordinates, contact.condyles)
+            geometry = replace(geometry, post=instant.post_loads(coordinates, contact.post))
+            lifted = frozenset(instant.sides - set(points)) if points else frozenset[str]()
+            share = muscles.share(replace(geometry, condyles=points), friction, lifted)
+            if last_contact is None and share.status != "ok":
                 share = muscles.share(geometry, friction, frozenset())
         if share.status != "ok":
             raise ComputationError(f"muscles: {share.status.removeprefix('failed: ')}")
         return share
 
     @property
-    def _keeps(self) -> bool:
+    def _has_residual_forces(self) -> bool:
         """Whether residual forces act, because a coordinate keeps its recorded value."""
         return len(self.released) < 5
 
     def _joint(
         self, instant: Instant, geometry: KneeGeometry, middle: Array, slack: bool
     ) -> JointEquilibrium:
-        ligaments, place = instant.ligaments, geometry.coordinates
+        ligaments, coordinates = instant.ligaments, geometry.coordinates
         if self._external is None or self._external[0] is not instant:
-            self._external = instant, external_wrench(geometry, place)
+            self._external = instant, external_wrench(geometry, coordinates)
         external = self._external[1]
         # The patella was lost in this call. It may be found in the next call.
         if not np.isfinite(external).all():
             self._external = None
-        return joint_equilibrium(geometry, ligaments, place, self.released, middle, slack, external)
+        return joint_equilibrium(
+            geometry, ligaments, coordinates, self.released, middle, slack, external
+        )
 
     def _forces(
         self,
         instant: Instant,
         joint: JointEquilibrium,
-        place: Array,
-        touch: "ProbedContact | None" = None,
+        coordinates: Array,
+        contact: "ProbedContact | None" = None,
     ) -> "ReleasedForces":
         friction = instant.friction
-        return ReleasedForces(joint, self._probe, place, friction, instant.sliding, touch)
+        return ReleasedForces(joint, self._probe, coordinates, friction, instant.sliding, contact)
 
 
-def ahead(ways: Sequence[float]) -> float:
+def remaining_distance(distances: Sequence[float]) -> float:
     """Return the remaining distance of converging passes, per distance of the last pass.
 
-    Let q be the larger of the last two ratios of successive distances. The remaining geometric
-    series has the sum q / (1 - q). The result is 1 if there were fewer than three passes, or if a
-    pass did not halve the distance of the previous pass.
+    Let q be the larger of the last two ratios of successive distances. The result is the sum
+    q / (1 - q) of the remaining geometric series. It is 1 if there were fewer than three passes, or
+    if a pass did not halve the distance of the previous pass.
 
     Args:
-        ways: distances of the last three passes, m; inf: no such pass.
+        distances: distances of the last three passes, m; inf: no such pass.
     """
-    first, second, last = ways
+    first, second, last = distances
     if not 0.0 < second <= 0.5 * first < np.inf or last > 0.5 * second:
         return 1.0
     ratio = max(last / second, second / first)
     return ratio / (1.0 - ratio)
 
 
-def _middle(contact: "ProbedContact", points: dict[str, Array] | None, place: Array) -> Array:
+def _middle(contact: "ProbedContact", points: dict[str, Array] | None, coordinates: Array) -> Array:
     contact_points = (points or {}) | {side: c.point for side, c in contact.condyles.items()}
     return (
-        np.asarray(np.mean(list(contact_points.values()), axis=0)) if contact_points else place[:3]
+        np.asarray(np.mean(list(contact_points.values()), axis=0))
+        if contact_points
+        else coordinates[:3]
     )

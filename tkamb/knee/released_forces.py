@@ -1,8 +1,8 @@
 """Generalised forces on the released knee coordinates, of a leg or of a simulator.
 
-The wrench between femur and shank balances ground reaction, weight and inertia of the shank. The
-shank moves as recorded, so this wrench does not depend on the knee coordinates. Contact, ligaments,
-muscles and the patellar ligament must add up to it:
+The shank moves as recorded. Its weight and inertia and the ground reaction therefore give a wrench
+w_external that does not depend on the knee coordinates. Contact, ligaments, muscles and the
+patellar ligament must balance this wrench:
 
     R(q, y) = w_external + w_ligaments(q) + w_muscles(q) + w_contact(q) + B y = 0   (on the insert)
 
@@ -41,7 +41,7 @@ class PatellarLine:
     """The first straight segment of the patellar ligament below the patella.
 
     Args:
-        end: end on the patella, which is fixed to the femur here, femur frame, shape (3,), m.
+        end: end on the patella, femur frame, shape (3,), m; the patella is fixed to the femur here.
         anchor: next point on the shank (tuberosity or front lip), insert frame, shape (3,), m.
     """
 
@@ -59,10 +59,10 @@ class JointEquilibrium:
     """The equations of equilibrium of the released knee coordinates at one frame.
 
     Args:
-        external: w_external on the insert, force and moment about its origin, shape (6,).
+        external: w_external on the insert, force and moment about the insert's origin, shape (6,).
         ligaments: the ligament bundles.
         line: the patellar ligament, which balances flexion; None: a moment balances flexion.
-        keeping: unit residual loads, the remaining columns of B, shape (6, m).
+        residual_loads: unit residual loads, the remaining columns of B, shape (6, m).
         released: indices of the n released coordinates.
         share: the muscles across the knee except the quadriceps; None: not modelled.
         tibia: pose of the tibia link in the insert frame, shape (4, 4).
@@ -71,12 +71,12 @@ class JointEquilibrium:
     external: Array
     ligaments: "BundleArrays"
     line: PatellarLine | None
-    keeping: Array
+    residual_loads: Array
     released: tuple[int, ...]
     share: MuscleShare | None = None
     tibia: Array = field(default_factory=lambda: np.eye(4))
 
-    def imbalance(self, coordinates: Array, contact: Array) -> Array:
+    def residual(self, coordinates: Array, contact: Array) -> Array:
         """Return r (..., n), the generalised forces on the released coordinates.
 
         Args:
@@ -97,9 +97,9 @@ class JointEquilibrium:
         """Return d r / d w_contact (n, 6) at coordinates (6,)."""
         axes, columns = knee_axes(coordinates), self.columns(coordinates)
         rows = axes[self._prescribed]
-        # This projection subtracts the reactions that balance a contact wrench.
-        through = np.eye(6) - columns @ np.linalg.solve(rows @ columns, rows)
-        return np.asarray(-axes[list(self.released)] @ through)
+        # The projection subtracts the reactions that balance a contact wrench.
+        projection = np.eye(6) - columns @ np.linalg.solve(rows @ columns, rows)
+        return np.asarray(-axes[list(self.released)] @ projection)
 
     def reactions_and_residual(self, coordinates: Array, contact: Array) -> tuple[Array, Array]:
         """Return y of `reactions`, and the residual wrench R (6,) on the insert."""
@@ -107,8 +107,8 @@ class JointEquilibrium:
         reactions = _magnitudes(axes[self._prescribed], columns, wrench)
         return reactions, wrench + columns @ reactions
 
-    def whole(self, coordinates: Array, contact: Array) -> Array:
-        """Return the generalised forces (m, 6) on all coordinates, with y of the last row.
+    def forces_on_all_coordinates(self, coordinates: Array, contact: Array) -> Array:
+        """Return the generalised forces (m, 6) on all coordinates, with the y of the last row.
 
         Args:
             coordinates: knee coordinates, shape (m, 6).
@@ -137,9 +137,11 @@ class JointEquilibrium:
     def _columns(self, poses: Array) -> Array:
         """Return B (..., 6, 6 - n) at poses (..., 4, 4)."""
         line = None if self.line is None else self.line.wrench(poses)[..., None]
-        if line is not None and not self.keeping.size:
+        if line is not None and not self.residual_loads.size:
             return line
-        columns = np.broadcast_to(self.keeping, (*poses.shape[:-2], *self.keeping.shape))
+        columns = np.broadcast_to(
+            self.residual_loads, (*poses.shape[:-2], *self.residual_loads.shape)
+        )
         return columns if line is None else np.concatenate([columns, line], axis=-1)
 
 
@@ -205,28 +207,29 @@ def patellar_line(geometry: KneeGeometry, coordinates: Array) -> PatellarLine:
     """Return the first straight segment of the patellar ligament at coordinates (6,)."""
     extensor, chain = geometry.extensor, geometry.state.chain
     assert extensor is not None
-    shank = [load for load in extensor.patellar_ligament if chain.on_shank(load.link)]
-    free = [load for load in extensor.patellar_ligament if not chain.on_shank(load.link)]
-    end, along = free[0].points[0], free[0].forces[0]
-    # The ligament may wrap the insert: its anchor is the nearest point on the shank along it.
-    away = min(float((load.points[0] - end) @ along) for load in shank)
-    return PatellarLine(transform(inverse(knee_pose(coordinates)), end), end + away * along)
+    shank_loads = [load for load in extensor.patellar_ligament if chain.on_shank(load.link)]
+    other_loads = [load for load in extensor.patellar_ligament if not chain.on_shank(load.link)]
+    end, direction = other_loads[0].points[0], other_loads[0].forces[0]
+    # The ligament may wrap the insert. The anchor is its first point on the shank.
+    distance = min(float((load.points[0] - end) @ direction) for load in shank_loads)
+    return PatellarLine(transform(inverse(knee_pose(coordinates)), end), end + distance * direction)
 
 
 def external_wrench(geometry: KneeGeometry, coordinates: Array) -> Array:
-    """Return the wrench (6,) of ground, weight and inertia on the shank, insert frame.
+    """Return the wrench (6,) of ground reaction, weight and inertia on the shank, insert frame.
 
-    It does not depend on the knee coordinates.
+    The wrench does not depend on the knee coordinates of the geometry.
     """
     state = geometry.state
     hip = unknowns.hip(state.point("hip", np.zeros(3)))
     ground = [geometry.ground] if geometry.ground else []
     columns = state.generalised([*(unknown.loads for unknown in hip), ground])
-    # As in `KneeSystem`: generalised forces that hip and knee supply together.
-    without = state.inertial - columns[:, -1]
-    # The knee's internal loads cancel in the six equations of the free root. These give the hip's.
-    at_hip = np.linalg.solve(columns[:6, :6], without[:6])
-    knee = (without - columns[:, :6] @ at_hip)[state.chain.knee_columns()]
+    # Generalised forces of hip and knee together, as in `KneeSystem`.
+    required = state.inertial - columns[:, -1]
+    # The internal loads of the knee cancel in the six equations of the free root, so these
+    # equations give the loads of the hip.
+    at_hip = np.linalg.solve(columns[:6, :6], required[:6])
+    knee = (required - columns[:, :6] @ at_hip)[state.chain.knee_columns()]
     # Generalised forces are axes times wrench: solve for the wrench on the tibia.
     return np.asarray(np.linalg.solve(knee_axes(coordinates), knee))
 
@@ -276,7 +279,7 @@ SCALE = np.array(
 Sliding = Callable[[Array, Array], Array]
 
 
-def _no_sliding(place: Array, point: Array) -> Array:
+def _no_sliding(coordinates: Array, point: Array) -> Array:
     return np.zeros(3)
 
 
@@ -287,7 +290,7 @@ class Joint(Protocol):
     def released(self) -> tuple[int, ...]:
         """Indices of the n free coordinates."""
 
-    def imbalance(self, coordinates: Array, contact: Array) -> Array:
+    def residual(self, coordinates: Array, contact: Array) -> Array:
         """Return the generalised forces (..., n) at coordinates (..., 6) and a contact (6,)."""
 
     def contact_gain(self, coordinates: Array) -> Array:
@@ -300,77 +303,80 @@ J = TypeVar("J", bound=Joint)
 class FreeForces(Generic[J]):
     """Generalised forces on the free coordinates of a joint at trial coordinates.
 
-    Coordinates and forces are scaled: rotations are multiplied by the lever arm, moments are
-    divided by it.
+    Coordinates and forces are scaled: rotations are multiplied by a lever arm, and moments are
+    divided by this arm.
 
     Args:
         joint: loads other than contact.
         probe: probe of the contact model.
-        place: knee coordinates, shape (6,), m and rad; coordinates that are not free keep these
-            values.
+        coordinates: knee coordinates, shape (6,), m and rad; coordinates that are not free keep
+            their values.
         friction: Coulomb coefficient.
         sliding: function of coordinates (6,) and a point (3,). It returns the velocity (3,), m/s,
             of the femur relative to the insert at that point.
-        touch: the contact at `place`; None: unknown.
+        contact: the contact at `coordinates`; None: unknown.
 
     Attributes:
-        seen: scaled coordinates as bytes -> contact at these coordinates.
+        contacts: scaled coordinates as bytes -> contact at these coordinates.
     """
 
     def __init__(
         self,
         joint: J,
         probe: "Probe",
-        place: Array,
+        coordinates: Array,
         friction: float = 0.0,
         sliding: Sliding = _no_sliding,
-        touch: "ProbedContact | None" = None,
+        contact: "ProbedContact | None" = None,
     ) -> None:
-        self._joint, self._probe, self._place = joint, probe, np.array(place, float)
+        self._joint, self._probe, self._coordinates = joint, probe, np.array(coordinates, float)
         self._friction, self._sliding = friction, sliding
         self._rows = list(joint.released)
         self._scale = SCALE[self._rows]
-        self._start = self._place[self._rows] * self._scale
-        self.seen: dict[bytes, ProbedContact] = {}
-        if touch is not None:
-            self.seen[self._start.tobytes()] = touch
+        self._start = self._coordinates[self._rows] * self._scale
+        self.contacts: dict[bytes, ProbedContact] = {}
+        if contact is not None:
+            self.contacts[self._start.tobytes()] = contact
 
     def balance(
-        self, stiffness: Array | None = None, residual_share: float = 0.0, reach: float = np.inf
+        self,
+        stiffness: Array | None = None,
+        residual_share: float = 0.0,
+        stop_distance: float = np.inf,
     ) -> Balance:
-        """Return the equilibrium of the free coordinates, with `place` as initial guess.
+        """Return the equilibrium of the free coordinates, with `coordinates` as initial guess.
 
         Args:
             stiffness: stiffness of an earlier, similar search, shape (n, n), N/m; None: unknown.
             residual_share: see `find_balance`.
-            reach: see `find_balance`, m.
+            stop_distance: see `find_balance`, m.
         """
-        return find_balance(self.trial, self._start, stiffness, residual_share, reach)
+        return find_balance(self.trial, self._start, stiffness, residual_share, stop_distance)
 
     def contact(self, balance: Balance) -> "ProbedContact":
         """Return the contact of a balance."""
-        return self.seen[balance.coordinates.tobytes()]
+        return self.contacts[balance.coordinates.tobytes()]
 
     def trial(self, x: Array) -> Trial:
         """Return scaled forces and stiffness at scaled coordinates (n,), m."""
-        place, key = self._with(x), x.tobytes()
-        contact = self.seen.get(key)
+        coordinates, key = self._coordinates_at(x), x.tobytes()
+        contact = self.contacts.get(key)
         if contact is None:
-            contact = self.seen[key] = self._probe.at(knee_pose(place))
+            contact = self.contacts[key] = self._probe.at(knee_pose(coordinates))
         if not contact.known:
             return Trial(np.full(len(x), np.nan))
-        wrench, stiffness = self._with_friction(place, contact)
+        wrench, stiffness = self._with_friction(coordinates, contact)
         force_noise = contact.accuracy * float(np.linalg.norm(wrench[:3]))
         if stiffness is None:
-            force = self._joint.imbalance(place, wrench) / self._scale
+            force = self._joint.residual(coordinates, wrench) / self._scale
             return Trial(force, force_noise=force_noise)
-        # The joint's loads at displaced coordinates; the last row is at the coordinates themselves.
+        # Forces at displaced coordinates; the last row is at the coordinates themselves.
         steps = np.zeros((len(x) + 1, 6))
         steps[np.arange(len(x)), self._rows] = RELEASED_FORCE.difference_step / self._scale
-        forces = self._joint.imbalance(place + steps, wrench) / self._scale
+        forces = self._joint.residual(coordinates + steps, wrench) / self._scale
         change = (forces[:-1] - forces[-1]).T / RELEASED_FORCE.difference_step
-        twists = knee_axes(place)[self._rows] / self._scale[:, None]
-        gain = self._joint.contact_gain(place) / self._scale[:, None]
+        twists = knee_axes(coordinates)[self._rows] / self._scale[:, None]
+        gain = self._joint.contact_gain(coordinates) / self._scale[:, None]
         tangent = -(change + gain @ stiffness @ twists.T)
         return Trial(forces[-1], tangent, contact.exact, force_noise)
 
@@ -380,25 +386,27 @@ class FreeForces(Generic[J]):
 
     def at(self, balance: Balance) -> Array:
         """Return the knee coordinates (6,) of a balance."""
-        return self._with(balance.coordinates)
+        return self._coordinates_at(balance.coordinates)
 
-    def _with(self, x: Array) -> Array:
-        place = self._place.copy()
-        place[self._rows] = x / self._scale
-        return place
+    def _coordinates_at(self, x: Array) -> Array:
+        coordinates = self._coordinates.copy()
+        coordinates[self._rows] = x / self._scale
+        return coordinates
 
-    def _with_friction(self, place: Array, contact: "ProbedContact") -> tuple[Array, Array | None]:
+    def _with_friction(
+        self, coordinates: Array, contact: "ProbedContact"
+    ) -> tuple[Array, Array | None]:
         """Return the wrench (6,) on the insert with friction, and its stiffness (6, 6) if known."""
         wrench, stiffness = np.zeros(6), np.zeros((6, 6))
         for condyle in contact.loads:
-            sliding = self._sliding(place, condyle.point)
-            touch = CondylePoint(condyle.point, condyle.normal, sliding, 0.0)
-            drag = touch.normal - touch.direction(self._friction)
-            rubbing = wrench_of(touch.point, drag)
-            wrench += condyle.wrench + condyle.force * rubbing
+            sliding = self._sliding(coordinates, condyle.point)
+            contact_point = CondylePoint(condyle.point, condyle.normal, sliding, 0.0)
+            friction_force = contact_point.normal - contact_point.direction(self._friction)
+            friction_wrench = wrench_of(contact_point.point, friction_force)
+            wrench += condyle.wrench + condyle.force * friction_wrench
             if condyle.stiffness is not None:
-                pressed = -touch.normal @ condyle.stiffness[:3]
-                stiffness += condyle.stiffness + np.outer(rubbing, pressed)
+                normal_stiffness = -contact_point.normal @ condyle.stiffness[:3]
+                stiffness += condyle.stiffness + np.outer(friction_wrench, normal_stiffness)
         return wrench, stiffness if contact.tangent else None
 
 
@@ -406,7 +414,7 @@ class ReleasedForces(FreeForces[JointEquilibrium]):
     """Forces on the released coordinates of a leg whose patella is fixed to the femur."""
 
     def tension_per_wrench(self, contact: "ProbedContact") -> Array | None:
-        """Return v (6,): a wrench dw on the insert adds v . dw to the patellar ligament's tension.
+        """Return v (6,): a wrench dw on the insert changes the ligament's tension by v . dw.
 
         The released coordinates move by dq to the new equilibrium. Let f = -J w be the generalised
         forces of contact, ligaments and muscles, and K = -df/dq. The equations
@@ -417,41 +425,41 @@ class ReleasedForces(FreeForces[JointEquilibrium]):
         patellar ligament is one of the reactions. The result is None if the contact has no tangent.
 
         Args:
-            contact: the contact in equilibrium at `place`.
+            contact: the contact in equilibrium at `coordinates`.
         """
-        place = self._place
-        wrench, stiffness = self._with_friction(place, contact)
+        coordinates = self._coordinates
+        wrench, stiffness = self._with_friction(coordinates, contact)
         if stiffness is None:
             return None
         steps = np.zeros((len(self._rows) + 1, 6))
         steps[np.arange(len(self._rows)), self._rows] = RELEASED_FORCE.difference_step / self._scale
-        forces = self._joint.whole(place + steps, wrench)
-        axes = knee_axes(place)
+        forces = self._joint.forces_on_all_coordinates(coordinates + steps, wrench)
+        axes = knee_axes(coordinates)
         twists = axes[self._rows] / self._scale[:, None]
         change = (
             forces[:-1] - forces[-1]
         ).T / RELEASED_FORCE.difference_step - axes @ stiffness @ twists.T
-        # Unknowns are dq and dy; the ligament's tension is the last of dy.
-        matrix = np.hstack([-change, axes @ self._joint.columns(place)])
+        # The unknowns are dq and dy. The ligament's tension is the last entry of y.
+        matrix = np.hstack([-change, axes @ self._joint.columns(coordinates)])
         return np.asarray(-np.linalg.solve(matrix, axes)[-1])
 
-    def tension_at_rest(self, contact: "ProbedContact", per_wrench: Array) -> float:
-        """Return the predicted tension (N) of the patellar ligament at equilibrium near `place`.
+    def tension_in_equilibrium(self, contact: "ProbedContact", per_wrench: Array) -> float:
+        """Return the predicted tension (N) of the patellar ligament at the near equilibrium.
 
-        The prediction is linear in the residual wrench at `place`.
+        The prediction is linear in the residual wrench at `coordinates`.
 
         Args:
-            contact: the contact at `place`.
+            contact: the contact at `coordinates`.
             per_wrench: result of `tension_per_wrench`, shape (6,).
         """
-        wrench, _ = self._with_friction(self._place, contact)
-        reactions, remainder = self._joint.reactions_and_residual(self._place, wrench)
+        wrench, _ = self._with_friction(self._coordinates, contact)
+        reactions, remainder = self._joint.reactions_and_residual(self._coordinates, wrench)
         return float(reactions[-1] + per_wrench @ remainder)
 
     def pushes(self, balance: Balance) -> bool:
         """Return whether a taut patellar ligament would have to push."""
         if self._joint.line is None:
             return False
-        place = self.at(balance)
-        wrench, _ = self._with_friction(place, self.contact(balance))
-        return bool(self._joint.reactions(place, wrench)[-1] < 0)
+        coordinates = self.at(balance)
+        wrench, _ = self._with_friction(coordinates, self.contact(balance))
+        return bool(self._joint.reactions(coordinates, wrench)[-1] < 0)

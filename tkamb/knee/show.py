@@ -35,7 +35,7 @@ class KneeDrawingSettings:
 KNEE_DRAWING = KneeDrawingSettings()
 
 PRESSURE_COLOURS = np.array([[0.27, 0.0, 0.33], [0.13, 0.57, 0.55], [0.99, 0.91, 0.14]])
-"""RGB from no pressure to the peak: three colours of viridis. Their lightness increases evenly."""
+"""RGB from no pressure to the peak: three colours of viridis, whose lightness increases evenly."""
 
 
 def show_knee(
@@ -58,39 +58,44 @@ def show_knee(
         knee: the knee.
         viewer: a `pin.visualize.MeshcatVisualizer`, or a `meshcat.Visualizer`.
         q: configuration, shape (nq,).
-        contact: contact from `Knee.press` or `Knee.evaluate`. The femur is drawn at its pose. None:
+        contact: contact from `Knee.press` or `Knee.evaluate`; the femur is drawn at its pose. None:
             the contact at q.
         node: name of the node in the viewer's tree.
-        newton: length of an arrow per newton, m.
+        newton: length of an arrow per newton, m/N.
         peak: pressure of the last colour, Pa; None: the peak pressure.
         opacity: opacity of the femoral component, 0 to 1.
 
     Raises:
-        InputError: the viewer is no MeshCat viewer.
+        InputError: the viewer is not a MeshCat viewer.
     """
     window, root = _window(viewer)
     tree = window[root][node] if root else window[node]
     tree.delete()
     data = knee.create_data()
-    place = knee.at(q, data)
+    kinematics = knee.at(q, data)
     insert = data.data.oMi[knee.bridge.insert.joint] * knee.bridge.insert.placement
     world = insert.homogeneous
     if contact is None and knee.contact is not None:
         contact = knee.evaluate(q)
-    femur = place.pose if contact is None else contact.pose
+    femur = kinematics.pose if contact is None else contact.pose
 
     def in_world(points: Array) -> Array:
         """Return points (n, 3) in the world, from the insert frame of a right knee."""
         return transform(world, points @ MIRROR if knee.left else points)
 
-    flip = mirrored_pose if knee.left else np.asarray
-    femur_in_world = world @ flip(femur)
+    to_side = mirrored_pose if knee.left else np.asarray
+    femur_in_world = world @ to_side(femur)
     _solid(tree["femoral"], knee.femoral, femur_in_world, knee.left, "femoral", opacity)
     _solid(tree["insert"], knee.insert, world, knee.left, "insert", 0.6)
     poses, patella = knee.link_poses(q, femur, data)
     if patella:
         _solid(
-            tree["patella"], knee.button, world @ flip(poses["patella"]), knee.left, "patella", 1.0
+            tree["patella"],
+            knee.button,
+            world @ to_side(poses["patella"]),
+            knee.left,
+            "patella",
+            1.0,
         )
     for bundle in knee.ligaments:
         if {bundle.proximal.link, bundle.distal.link} <= set(poses):
@@ -103,9 +108,9 @@ def show_knee(
         for side, condyle in (("medial", contact.medial), ("lateral", contact.lateral)):
             if condyle is None:
                 continue
-            own = contact.nodal_force[_side(contact, knee, side)].sum(axis=0)
+            force = contact.nodal_force[_side(contact, knee, side)].sum(axis=0)
             start = condyle.centre_of_pressure
-            path = in_world(np.array([start, start - newton * own]))
+            path = in_world(np.array([start, start - newton * force]))
             _strand(tree["force"][side], path, ARROW, KNEE_DRAWING.arrow_radius)
 
 
@@ -114,7 +119,7 @@ def _window(viewer: Any) -> tuple[Any, str]:
     inner = getattr(viewer, "viewer", viewer)
     if not hasattr(inner, "set_object"):
         raise InputError(
-            f"{type(viewer).__name__} is no MeshCat viewer",
+            f"{type(viewer).__name__} is not a MeshCat viewer",
             "Knee.show",
             "give a pin.visualize.MeshcatVisualizer after initViewer()",
         )
@@ -134,11 +139,11 @@ def _solid(
 ) -> None:
     if surface is None:
         return
-    own = mirrored_surface(surface) if is_left else surface
+    mesh = mirrored_surface(surface) if is_left else surface
     material = geometry.MeshPhongMaterial(
         color=COLOURS[part], opacity=opacity, transparent=opacity < 1.0
     )
-    node.set_object(geometry.TriangularMeshGeometry(own.vertices, own.faces), material)
+    node.set_object(geometry.TriangularMeshGeometry(mesh.vertices, mesh.faces), material)
     node.set_transform(pose)
 
 
@@ -168,10 +173,11 @@ def _map(
     loaded = triangles[(contact.pressure[triangles] > 0.0).any(axis=1)]
     if not len(loaded):
         return
-    top = float(contact.pressure.max()) if peak is None else peak
-    share = np.clip(contact.pressure / top, 0.0, 1.0)
+    peak_pressure = float(contact.pressure.max()) if peak is None else peak
+    share = np.clip(contact.pressure / peak_pressure, 0.0, 1.0)
     ramp = np.linspace(0.0, 1.0, len(PRESSURE_COLOURS))
-    colours = np.stack([np.interp(share, ramp, one) for one in PRESSURE_COLOURS.T], axis=1)
+    colours = np.stack([np.interp(share, ramp, channel) for channel in PRESSURE_COLOURS.T], axis=1)
+    # Above the insert's surface, which would hide a part of the map.
     points = in_world(contact.points + 1e-4 * contact.normals)
     material = geometry.MeshBasicMaterial(vertexColors=True, side="DoubleSide")
     node.set_object(geometry.TriangularMeshGeometry(points, loaded, colours), material)

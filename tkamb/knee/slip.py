@@ -1,18 +1,19 @@
 """Rolling and slipping of the femoral condyles on the insert, by arc lengths.
 
 From frame to frame the lowest point of a condyle moves by an arc a_f on the femoral surface, and
-its projection moves by an arc a_i on the insert. The arcs lie in the insert's sagittal plane. They
-are positive if the contact moves backwards, as in flexion. In rolling the two arcs are equal. The
-part of a_i due to axial rotation about the geometric centre of the femoral component is subtracted:
+the projection of this point moves by an arc a_i on the insert. The arcs lie in the insert's
+sagittal plane. They are positive if the contact moves backwards, as in flexion. In rolling the two
+arcs are equal. Axial rotation about the geometric centre of the femoral component causes the part
+a_axial of a_i:
 
     slip = sum (a_f - (a_i - a_axial)),   a_axial = d(alpha) (z_condyle - z_centre) / cos(slope)
 
 alpha is positive if the femur rotates externally. Slip is positive if the femur's surface slides
-forwards on the insert. Its rate is the x velocity of the femur's contact point relative to the
-insert, without the axial part. `sliding_velocity` computes this rate without arcs.
+forwards on the insert. The rate of the slip is the x velocity of the femur's contact point relative
+to the insert, without the axial part. `sliding_velocity` computes this rate without arcs.
 
 If the tangent of a profile turns by d between two points, the arc is chord (d/2)/sin(d/2). This is
-exact on a circle. On a profile of changing curvature the error is of third order in the step.
+exact on a circle. On other profiles the error is of third order in the step.
 """
 
 from dataclasses import dataclass
@@ -31,7 +32,7 @@ UP = np.array([0.0, 1.0, 0.0])
 class CondyleSlip:
     """Rolling and slipping of one condyle over f frames, cumulated from the first frame.
 
-    All values are NaN from the first frame in which the condyle is beside the insert.
+    All values are NaN from the first frame in which the condyle does not lie over the insert.
 
     Args:
         femoral_arc: arc on the femoral surface, positive backwards, shape (f,), m.
@@ -136,9 +137,8 @@ def slip_of_points(
 def femoral_arcs(points: Array, poses: Array) -> Array:
     """Return the arcs (f-1,), m, between successive lowest points, on the femoral surface.
 
-    At a lowest point the surface's normal is the insert's -y. The profile's tangent therefore turns
-    by the rotation of the femur about its ML axis. An arc is positive backwards. Its chord lies in
-    the insert's sagittal plane.
+    At a lowest point the normal of the surface is the insert's -y. The tangent of the profile
+    therefore turns by the rotation of the femur about its ML axis.
 
     Args:
         points: lowest points, insert frame, shape (f, 3), m.
@@ -146,7 +146,7 @@ def femoral_arcs(points: Array, poses: Array) -> Array:
     """
     back = inverse(poses)
     in_femur = transform(back, points[:, None])[:, 0]
-    # The change of the downward normal's angle in femoral axes is the turn of the arc.
+    # The downward normal turns by the angle of the arc in femoral axes.
     normal = rotate(back, -UP)
     angle = np.unwrap(np.arctan2(normal[:, 1], normal[:, 0]))
     chord = np.diff(in_femur, axis=0)

@@ -35,7 +35,7 @@ class InitialPoseSettings:
     """m: largest extrapolation from the last frame. Chosen because a guess far from the solution
     costs more time than it saves."""
     first_penetration: float = 5e-5
-    """m: penetration of the initial guess of a first frame. Chosen because a loaded contact of
+    """m: penetration of an initial guess at first touch. Chosen because a loaded contact of
     polyethylene has more penetration, and the search also finds a lightly loaded contact from this
     guess."""
     max_continuation: float = 1e-3
@@ -67,10 +67,10 @@ class InitialPoses:
     def __init__(self, knee: ReleasedKnee, pair: ContactPair, post: "CamPost | None") -> None:
         self._knee, self._pair, self._post = knee, pair, post
 
-    def rest(
+    def equilibrium(
         self, instant: Instant, previous: Sequence[KneeEquilibrium], points: dict[str, Array]
     ) -> KneeEquilibrium:
-        """Return the equilibrium from the first initial guess that converges.
+        """Return the equilibrium from the first initial guess from which the search converges.
 
         If the equilibrium is farther than `INITIAL_POSE.max_continuation` from that guess, the
         search is repeated from other guesses. If such a search ends at another equilibrium,
@@ -87,12 +87,12 @@ class InitialPoses:
         """
         knee, failure = None, "the femoral component does not lie over the insert"
         recorded = instant.coordinates
-        starts = self._starts(recorded, [knee.coordinates for knee in previous])
-        for place in starts:
-            if not np.isfinite(place).all():
+        starts = self._guesses(recorded, [knee.coordinates for knee in previous])
+        for guess in starts:
+            if not np.isfinite(guess).all():
                 continue
             try:
-                knee = self._knee.find(instant, place, points, previous[-1] if previous else None)
+                knee = self._knee.find(instant, guess, points, previous[-1] if previous else None)
             except ComputationError as error:
                 failure = error.what
                 continue
@@ -100,17 +100,17 @@ class InitialPoses:
                 break
         if knee is None:
             raise ComputationError(failure)
-        if knee.problem or _apart(place, knee.coordinates) <= INITIAL_POSE.max_continuation:
+        if knee.problem or _distance(guess, knee.coordinates) <= INITIAL_POSE.max_continuation:
             return knee
-        others = list(starts) or self._beside(instant)
+        others = list(starts) or self._shifted_guesses(instant)
         return replace(knee, second=self._second(instant, knee, others, points))
 
-    def _beside(self, instant: Instant) -> list[Array]:
+    def _shifted_guesses(self, instant: Instant) -> list[Array]:
         """Return the recorded pose shifted anteriorly and posteriorly, at first touch."""
-        places = [instant.coordinates.copy(), instant.coordinates.copy()]
-        for place, sign in zip(places, (1.0, -1.0), strict=True):
-            place[AP] += sign * INITIAL_POSE.other_shift * (AP in self._knee.released)
-        return [self.on_the_insert(place) for place in places]
+        guesses = [instant.coordinates.copy(), instant.coordinates.copy()]
+        for guess, sign in zip(guesses, (1.0, -1.0), strict=True):
+            guess[AP] += sign * INITIAL_POSE.other_shift * (AP in self._knee.released)
+        return [self.at_first_touch(guess) for guess in guesses]
 
     def _second(
         self,
@@ -119,76 +119,78 @@ class InitialPoses:
         starts: list[Array],
         points: dict[str, Array],
     ) -> str:
-        """Return words that describe a second equilibrium from other guesses; empty: not found."""
-        for place in starts:
-            if not np.isfinite(place).all():
+        """Return a description of a second equilibrium from other guesses; empty: not found."""
+        for guess in starts:
+            if not np.isfinite(guess).all():
                 continue
             try:
-                other = self._knee.find(instant, place, points)
+                other = self._knee.find(instant, guess, points)
             except ComputationError:
                 continue
-            apart = _apart(other.coordinates, knee.coordinates)
-            if other.problem or apart <= INITIAL_POSE.same_place:
+            distance = _distance(other.coordinates, knee.coordinates)
+            if other.problem or distance <= INITIAL_POSE.same_place:
                 continue
-            moved = np.abs(other.coordinates - knee.coordinates)
+            displacement = np.abs(other.coordinates - knee.coordinates)
             forces = [np.linalg.norm(one.contact.wrench[:3]) for one in (knee, other)]
             return (
                 f"a second equilibrium: from another initial guess the search ends "
-                f"{moved[:3].max() / MILLIMETRE:.1f} mm and {moved[3:].max() / DEGREE:.1f} deg "
-                f"away, with {forces[1]:.0f} N instead of {forces[0]:.0f} N of contact force"
+                f"{displacement[:3].max() / MILLIMETRE:.1f} mm and "
+                f"{displacement[3:].max() / DEGREE:.1f} deg away, "
+                f"with {forces[1]:.0f} N instead of {forces[0]:.0f} N of contact force"
             )
         return ""
 
-    def _starts(self, recorded: Array, previous: list[Array]) -> Iterator[Array]:
-        """Yield three initial guesses: extrapolated, of the last frame, and recorded.
+    def _guesses(self, recorded: Array, previous: list[Array]) -> Iterator[Array]:
+        """Yield up to three initial guesses: extrapolated, of the last frame, and recorded.
 
-        The extrapolated guess keeps its height. The other two are moved to first touch.
+        The extrapolated guess keeps its height. The other two are at first touch.
         """
         rows = list(self._knee.released)
-        for number, place in enumerate([carried_on(previous), previous[-1]] if previous else []):
-            start = recorded.copy()
-            start[rows] = place[rows]
-            yield start if number == 0 else self.on_the_insert(start)
-        yield self.on_the_insert(recorded)
+        for number, released_guess in enumerate(
+            [extrapolated(previous), previous[-1]] if previous else []
+        ):
+            guess = recorded.copy()
+            guess[rows] = released_guess[rows]
+            yield guess if number == 0 else self.at_first_touch(guess)
+        yield self.at_first_touch(recorded)
 
-    def on_the_insert(self, place: Array) -> Array:
+    def at_first_touch(self, coordinates: Array) -> Array:
         """Return coordinates (6,), m and rad, with the height changed to first touch.
 
-        If AP is released and cam and post overlap, AP is changed to the first touch of cam and
-        post.
+        If AP is released and cam and post overlap, AP is changed to their first touch.
         """
-        touching = self._on_the_dishes(place)
+        touching = self._on_the_dishes(coordinates)
         if self._post is None or AP not in self._knee.released:
             return touching
         gap = self._post.clearance(knee_pose(touching))
         if not gap < 0:
             return touching
         return self._on_the_dishes(
-            np.array([place[0] + gap + INITIAL_POSE.first_penetration, *place[1:]])
+            np.array([coordinates[0] + gap + INITIAL_POSE.first_penetration, *coordinates[1:]])
         )
 
-    def _on_the_dishes(self, place: Array) -> Array:
-        height = self._pair.first_touch_height(knee_pose(place))
-        return np.array([place[0], height - INITIAL_POSE.first_penetration, *place[2:]])
+    def _on_the_dishes(self, coordinates: Array) -> Array:
+        height = self._pair.first_touch_height(knee_pose(coordinates))
+        return np.array([coordinates[0], height - INITIAL_POSE.first_penetration, *coordinates[2:]])
 
 
-def _apart(first: Array, second: Array) -> float:
+def _distance(first: Array, second: Array) -> float:
     """Return the largest distance (m) between coordinates (6,), rotations times the lever arm."""
     return float(np.abs((second - first) * SCALE).max())
 
 
-def carried_on(previous: list[Array]) -> Array:
+def extrapolated(previous: list[Array]) -> Array:
     """Return coordinates (6,) extrapolated from up to three frames.
 
     The last step is repeated with a factor from 0 to 1, the projection of the last step on the
-    previous step. The extrapolation is limited to `INITIAL_POSE.max_extrapolation`, because a
-    lightly loaded knee moves irregularly.
+    previous step. `INITIAL_POSE.max_extrapolation` limits the extrapolation, because a lightly
+    loaded knee moves irregularly.
     """
     if len(previous) < 3:
         return previous[-1]
-    before, step = ((b - a) * SCALE for a, b in pairwise(previous))
-    # A steady motion has part = 1. A motion that reverses has part < 0: the guess is then the last
-    # frame.
-    part = float(before @ step) / max(float(before @ before), 1e-18)
-    longest = INITIAL_POSE.max_extrapolation / max(float(np.linalg.norm(step)), 1e-9)
-    return previous[-1] + min(max(part, 0.0), 1.0, longest) * (previous[-1] - previous[-2])
+    last_but_one, step = ((b - a) * SCALE for a, b in pairwise(previous))
+    # The factor of a steady motion is 1. If the motion reverses, the factor is negative, and the
+    # guess is the last frame.
+    factor = float(last_but_one @ step) / max(float(last_but_one @ last_but_one), 1e-18)
+    limit = INITIAL_POSE.max_extrapolation / max(float(np.linalg.norm(step)), 1e-9)
+    return previous[-1] + min(max(factor, 0.0), 1.0, limit) * (previous[-1] - previous[-2])

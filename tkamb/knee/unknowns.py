@@ -35,9 +35,8 @@ class UnknownsSettings:
     max_condition: float = 1e4
     """1: condition number (unit columns) above which a frame counts as singular. The number is
     about 7 to 9 m / d, where d is the moment arm of the patellar ligament about the femorotibial
-    contact. The shipped knee has d = 43 to 45 mm and condition numbers of 148 to 218. Chosen
-    because at the limit, d = 0.8 mm, an error of 1 mm in a line of action exceeds the whole
-    force."""
+    contact. Chosen because at the limit, d = 0.8 mm, an error of 1 mm in a line of action changes
+    the force by more than 100 %."""
 
 
 UNKNOWNS = UnknownsSettings()
@@ -97,7 +96,7 @@ AXES = {"ap": np.array([1.0, 0, 0]), "si": np.array([0, 1.0, 0]), "ml": np.array
 """Insert axes: x anterior, y superior, z to the right."""
 
 MUSCLE = "muscle_"
-"""First part of the name of a muscle's tension among the unknowns."""
+"""Prefix of the name of a muscle's tension among the unknowns."""
 
 
 def pair(link: str, other: str, point: Array, force: Array) -> tuple[PointForces, ...]:
@@ -198,7 +197,7 @@ def residuals(point: Array, lifted: bool, extensor: bool) -> list[Unknown]:
     Args:
         point: midpoint of the contact points, where the residual forces act, shape (3,), m.
         lifted: whether a condyle is lifted off; a coronal moment then replaces its force.
-        extensor: whether muscles act; without muscles a flexion moment is an additional residual.
+        extensor: whether the extensor group acts; if not, a flexion moment is another residual.
     """
     unknowns = [
         Unknown("residual_ap", pair("tibia", "femur", point, AXES["ap"])),
@@ -220,7 +219,7 @@ class LoadStateSettings:
     """N: a smaller force of the wrong sign counts as zero. Chosen because it is above rounding
     errors."""
     patella_moment: float = 0.25
-    """N·m: largest missing extension moment in the state of a slack extensor mechanism. Chosen
+    """N·m: largest extension moment that may be missing if the extensor mechanism is slack. Chosen
     because weight and inertia of the patella, up to 5 N on an arm of 45 mm, cause such a moment."""
 
 
@@ -250,7 +249,7 @@ class LoadState(NamedTuple):
 
 
 def load_states(
-    sides: Iterable[str], off: frozenset[str], extensors: Iterable[str]
+    sides: Iterable[str], lifted_by_gap: frozenset[str], extensors: Iterable[str]
 ) -> list[LoadState]:
     """Return the load states to try, the preferred states first.
 
@@ -259,11 +258,14 @@ def load_states(
 
     Args:
         sides: names of the modelled condyles.
-        off: sides that are lifted off the insert by their recorded gap.
+        lifted_by_gap: sides that are lifted off the insert by their recorded gap.
         extensors: names of the extensor muscles; empty: they are not modelled.
     """
-    near = [side for side in sides if side not in off]
-    lifted = [off, *(off | {side} for side in near if len(near) == 2)]
+    not_lifted = [side for side in sides if side not in lifted_by_gap]
+    lifted = [
+        lifted_by_gap,
+        *(lifted_by_gap | {side} for side in not_lifted if len(not_lifted) == 2),
+    ]
     slack = dict.fromkeys([frozenset[str](), frozenset(extensors)])
     states = [LoadState(*state) for state in product(lifted, slack)]
     return sorted(
@@ -295,16 +297,16 @@ def wrong_signs(state: LoadState, solution: Solution) -> list[str]:
 
 
 def contradictions(
-    state: LoadState, solutions: Mapping[LoadState, Solution], off: frozenset[str]
+    state: LoadState, solutions: Mapping[LoadState, Solution], lifted_by_gap: frozenset[str]
 ) -> list[str]:
     """Return reasons why a load state is inadmissible; empty: it is admissible.
 
-    A load has the wrong sign, or a load that is assumed to be zero would act with the right sign.
+    The reason is a load of the wrong sign, or a zero load that would act with the right sign.
 
     Args:
         state: the load state.
         solutions: load state -> its solution, for all states.
-        off: sides that are lifted off the insert by their recorded gap.
+        lifted_by_gap: sides that are lifted off the insert by their recorded gap.
     """
     wrong = wrong_signs(state, solutions[state])
     if state.slack:
@@ -313,7 +315,7 @@ def contradictions(
         if not min(pulls.values()) < -LOAD_STATE.force_rounding:
             name, pull = next(iter(pulls.items()))
             wrong.append(f"{name.removeprefix(MUSCLE)} would pull with {pull:.3g} N")
-    for side in sorted(state.lifted - off):
+    for side in sorted(state.lifted - lifted_by_gap):
         alternative = solutions[LoadState(state.lifted - {side}, state.slack)]
         force = alternative.values[f"{side}_normal"]
         if not force < 0.0:

@@ -1,17 +1,17 @@
 """The taut path of a massless string around a bone's convex sagittal outline.
 
 The bone is a general cylinder: a convex polygon in its x-y plane, extruded along z. The string
-passes in front of the bone: in a view with x to the right and y up, a string from top to bottom has
-the bone on its right-hand side. Unrolling the cylinder gives the shortest length. If S is the
-length of the taut path in the x-y plane,
+passes in front of the bone (+x): with x to the right and y up it runs clockwise from start to end.
+The unrolled cylinder gives the shortest length. If S is the length of the taut path in the x-y
+plane,
 
     L = sqrt(S² + dz²),   z linear in S.
 
-The length is continuous: when the tangent corner changes or wrapping begins, the two candidate
-paths coincide. So the moment arm has no jump.
+When the tangent corner changes or wrapping begins, the two candidate paths coincide. Length and
+moment arm are therefore continuous.
 
 There is no friction: the tension is constant along the string. The force of the string on the bone
-at a corner is the tension times the change of direction. It has no z component.
+at a corner is the tension times the change of direction. This force has no z component.
 """
 
 from dataclasses import dataclass
@@ -53,12 +53,12 @@ class TautPath:
 
     @property
     def start_direction(self) -> Array:
-        """Unit vector (3,) along the string at its start. Tension pulls the start along it."""
+        """Unit vector (3,) along the string at its start. Tension pulls the start this way."""
         return np.asarray(self.directions[0])
 
     @property
     def end_direction(self) -> Array:
-        """Unit vector (3,) along the string at its end. Tension pulls the end against it."""
+        """Unit vector (3,) along the string at its end. Tension pulls the end the opposite way."""
         return np.asarray(self.directions[-1])
 
     def moved(self, pose_here_in_there: Array) -> "TautPath":
@@ -163,8 +163,7 @@ def _taut(start: Array, end: Array, outline: Array) -> tuple[Array, float, float
     """Return the taut path's points (m, 3), length and turn, and the end inside the outline.
 
     The path is straight if the segment misses the outline. Otherwise it touches the outline from
-    the corner of the tangent through the start to the corner of the tangent through the end. At
-    these corners the outline's edges change from visible to hidden.
+    the corner of the tangent through the start to the corner of the tangent through the end.
 
     Args:
         start: start of the path, shape (3,), m.
@@ -177,7 +176,7 @@ def _taut(start: Array, end: Array, outline: Array) -> tuple[Array, float, float
     if _is_inside(end, outline):
         return ends, straight, 0.0, END
     # A straight line is taut if it misses the bone. The swept angle is between -90 and 270 deg: a
-    # path of more than 90 deg backwards passes around the front.
+    # string that would sweep less than -90 deg passes around the front instead.
     if _sweep(start, end, outline) >= -0.5 * np.pi and not _crosses(start, end, outline):
         return ends, straight, 0.0, NEITHER
     count, first, last = len(outline), -1, -1

@@ -1,4 +1,4 @@
-"""The columns of results.csv in their order. The page of the documentation is made from them."""
+"""The columns of results.csv in their order, as docs/results.md lists them."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -220,7 +220,7 @@ COLUMNS: tuple[Column, ...] = (
         )
         for side in ("medial", "lateral")
     ),
-    Column("ap_mm", "femoral origin of the pose of the contact, insert x", _CONTACT),
+    Column("ap_mm", "femoral origin at the pose of the contact, insert x", _CONTACT),
     Column("si_mm", "the same, insert y", _CONTACT),
     Column("ml_mm", "the same, insert z", _CONTACT),
     Column(
@@ -395,9 +395,9 @@ def ligament_of(column: str) -> str:
 
 
 def ordered_names(present: Iterable[str]) -> tuple[str, ...]:
-    """Return the columns of a file in order: all fixed ones, and from `present` the others.
+    """Return the columns of a file in order.
 
-    The others are members of families and optional columns.
+    Members of families and optional columns are included only if `present` names them.
     """
     present = list(present)
     names: list[str] = []

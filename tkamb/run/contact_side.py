@@ -52,8 +52,8 @@ class CouplingSettings:
     """N: largest change of the load in a converged iteration. Chosen because no contact model
     resolves a ten-thousandth of a body weight."""
     point_tolerance: float = 1e-6
-    """m: largest travel of a centre of pressure in a converged iteration. Chosen because it is too
-    small to change a force."""
+    """m: largest travel of a centre of pressure in a converged iteration. A smaller travel
+    does not change a force."""
     max_iterations: int = 20
     """1: iterations after which a frame fails. Chosen because frames that converge need fewer."""
     stiffness_error: float = 0.02
@@ -72,8 +72,8 @@ class ContactSide:
         coupled: whether the contact's resultants replace the contact points in the equations.
         released: names of the released coordinates.
         post: cam and post; None: not modelled.
-        sensitivity: whether to compute the change of the medial force with adduction. It takes one
-            more press with a contact model that has no tangent.
+        sensitivity: whether to compute the change of the medial force with adduction. A contact
+            model without a tangent needs one more press for it.
         prepare_seconds: computing time of the preparation of the contact model, s.
 
     Attributes:
@@ -110,7 +110,7 @@ class ContactSide:
         """Return loads and contact of frame k, coupled as the scene states.
 
         Args:
-            k: frame.
+            k: index of the frame.
             before: contacts of the earlier frames, for warm start and initial guess.
         """
         if self.released is None:
@@ -216,7 +216,7 @@ class ContactSide:
         """Return loads and contact with the released coordinates in equilibrium.
 
         Args:
-            k: frame.
+            k: index of the frame.
             before: contacts of the earlier frames. The initial guess extrapolates the last three
                 equilibria.
         """
@@ -229,7 +229,9 @@ class ContactSide:
         if len(released.released) < 5:
             points = mechanics.knee.nearest_points(instant.coordinates)
         try:
-            knee = self.starts.rest(instant, [c.equilibrium for c in good if c.equilibrium], points)
+            knee = self.starts.equilibrium(
+                instant, [c.equilibrium for c in good if c.equilibrium], points
+            )
         except ComputationError as error:
             contact = self.failed(error.what)
             body = mechanics.frame(k)
@@ -310,13 +312,13 @@ class ContactSide:
 def _equilibrium_flags(knee: "KneeEquilibrium") -> tuple[str, ...]:
     """Return the flags of an equilibrium: a second equilibrium, an inaccurate compliance."""
     second = (knee.second,) if knee.second else ()
-    if knee.doubt <= COUPLING.stiffness_error:
+    if knee.compliance_error <= COUPLING.stiffness_error:
         return second
     return (
         *second,
-        "the response of the knee's coordinates to the muscles has not converged "
-        f"(relative error {100 * knee.doubt:.0f} %): with other initial guesses such frames "
-        "differed by up to 3 % in the total force and 60 N in the force of one condyle",
+        "the response of the knee's coordinates to the muscles has not converged (relative error "
+        f"{100 * knee.compliance_error:.0f} %): with other initial guesses such frames differed by "
+        "up to 3 % in the total force and 60 N in the force of one condyle",
     )
 
 

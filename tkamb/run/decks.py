@@ -4,8 +4,8 @@ Both decks contain the hexahedra of the insert and a rigid patch of the femoral 
 along y only.
 
 CalculiX: contact is node to surface by penalty. The force on a node is its pressure times its
-tributary area of the deformed faces. The patch is a layer of wedges. Its initial position is at a
-guessed depth in the insert, under the whole load, and CalculiX finds the equilibrium.
+tributary area of the deformed faces. The patch is a layer of wedges. It
+starts at a guessed depth in the insert, under the whole load. CalculiX finds the equilibrium.
 
 FEBio: the insert is an isotropic elastic (St. Venant-Kirchhoff) solid in finite deformation.
 Contact is sliding-elastic and frictionless, by augmented Lagrangian. The patch is displaced from
@@ -166,7 +166,7 @@ class FebioDeckSettings:
     """Numbers of a deck for FEBio."""
 
     load_steps: int = 10
-    """1: steps of the displacement. Chosen because FEBio divides a step that fails."""
+    """1: steps of the displacement. FEBio divides a step that fails."""
 
 
 FEBIO_DECK = FebioDeckSettings()

@@ -119,8 +119,7 @@ class TrialError:
         frames: number of compared frames.
         bias: mean of the error over the frames.
         scatter: standard deviation of the error over the frames.
-        independent_frames: number of independent frames that determine the variance of the scatter
-            equally well.
+        independent_frames: effective sample size of the variance of the scatter.
         inputs: root mean square over the frames of the standard deviation due to the inputs, as a
             share of G.
         correlation_s: time in which the autocorrelation of the error falls to 1/e, s.

@@ -5,7 +5,7 @@ def frames_slice(text: str) -> slice:
     """Return the slice of a text A:B or A:B:STEP.
 
     Raises:
-        ValueError: the text is neither.
+        ValueError: the text has another form.
     """
     parts = text.split(":")
     if not 2 <= len(parts) <= 3:

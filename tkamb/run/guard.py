@@ -1,7 +1,7 @@
 """Execution of a command, with each error as one line on standard error.
 
-Exit statuses: 0 success, 1 failure, 2 bad input, 130 interrupted. An unexpected error is one line
-too. Its traceback is written to a log file.
+Exit statuses: 0 success, 1 failure, 2 bad input, 130 interrupted. The
+traceback of an unexpected error is written to a log file.
 """
 
 import argparse
@@ -221,7 +221,7 @@ def unforeseen_words(error: Exception, options: argparse.Namespace) -> str:
 
 
 def _write_log(error: Exception, options: argparse.Namespace) -> Path | None:
-    """Write the traceback to the first writable folder; None: there is none."""
+    """Write the traceback to the first writable folder; None: no folder is writable."""
     text = "".join(
         (
             f"tkamb {__version__}, {datetime.now(UTC).isoformat(timespec='seconds')}\n",

@@ -83,7 +83,7 @@ def scene_hash(case: "Case") -> str:
 def run_identity(case: "Case", frames: range) -> dict[str, Any]:
     """Return the identity of a run: hashes of scene, files and code, frames and version.
 
-    The identity of a run with a plug-in's contact model includes the hash of its package.
+    The identity of a run with a plug-in's contact model includes the hash of the plug-in.
     """
     identity = {
         "scene": scene_hash(case),

@@ -2,8 +2,8 @@
 
 An error is relative to a converged reference. The stored value is the largest error over the
 measured cases. It is no bound for other cases. The cases are those of the trade-off study and
-half of the pairs of bodies of `scripts/error_cases.py`. The other half is held out to test which
-share of new errors is below the stored ones (docs/known_errors.md). `scripts/make_tradeoff_table`
+half of the pairs of bodies of `scripts/error_cases.py`. The other half is held out. It tests the
+share of new errors below the stored ones (docs/known_errors.md). `scripts/make_tradeoff_table`
 writes `run/known_errors.json`. Errors of other settings are not interpolated but reported as "not
 measured".
 """
@@ -46,7 +46,7 @@ class KnownError:
         area: error of a condyle's contact area.
         cases: number of measured cases.
         situations: place of the contact ("interior", "flank", "edge") -> quantity -> largest error
-            at that place. Contacts with other flags than that of the edge are excluded.
+            at that place. Contacts with a flag that is not about the edge are excluded.
         covered: share of the errors on held-out pairs below the stored errors; None: no pair was
             held out.
     """

@@ -39,8 +39,8 @@ class MapWriteSettings:
     """How pressure maps are written."""
 
     buffer_bytes: float = 4e6
-    """bytes: size of the maps that are collected for one write. Chosen because a write takes as
-    long as the maps of one frame."""
+    """bytes: size of the maps that are collected for one write. More means fewer writes, but
+    more frames lost if the process is killed."""
 
 
 MAP_WRITE = MapWriteSettings()
@@ -231,7 +231,7 @@ class ContactMaps:
     """The pressure maps of a run, from memory or from contact.h5.
 
     Each array of the file is read on first access. Shapes are given with f frames, n points and k
-    triangles. All arrays are in SI units and the insert frame. A failed frame is NaN.
+    triangles. All arrays are in SI units and the insert frame. They are NaN in failed frames.
 
     Args:
         source: path of contact.h5, or the arrays by their names in the file.

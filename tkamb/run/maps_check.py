@@ -18,7 +18,7 @@ WRITTEN = "run it again, or ask whoever sent it for a folder that `tkamb run` wr
 FILTERS = frozenset({h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE})
 """Compression filters that tkamb uses. Any other filter could load a library."""
 SHARE_OF_MEMORY = 0.25
-"""1: largest size of an array as a share of the available memory. A report needs about three."""
+"""1: largest size of an array as a share of the available memory. A report reads about three."""
 FARTHEST = 10.0
 """m: largest distance of a point from the insert's origin."""
 

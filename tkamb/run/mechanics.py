@@ -76,7 +76,7 @@ class FrameLoads:
     Args:
         geometry: geometry in the equations.
         loads: solution of the equations.
-        adjustment: femoral adjustment; None: none, or it is impossible.
+        adjustment: femoral adjustment; None: not requested, or impossible.
         query_seconds: computing time of the closest points on the meshes, s.
         seconds: computing time of the rest, s.
         effect: change of the forces by the adjustment; None without an adjustment, or without a

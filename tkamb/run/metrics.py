@@ -39,7 +39,7 @@ class Peak:
 
     Args:
         value: value in the unit of the column.
-        frame: frame of the value.
+        frame: index of the frame.
         side: "medial" or "lateral"; "" for a column without sides.
     """
 

@@ -231,7 +231,7 @@ def _cells_of(path: Path) -> dict[str, tuple[str, ...]]:
     except csv.Error as error:
         raise InputError(f"cannot be read as CSV ({error})", path) from None
     if not rows:
-        raise InputError("is empty", path)
+        raise InputError("is empty", path, "run the scene again")
     header, body = [RENAMED.get(name, name) for name in rows[0]], rows[1:]
     for number, row in enumerate(body, start=2):
         if len(row) != len(header):

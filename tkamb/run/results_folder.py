@@ -61,7 +61,10 @@ def read_results(directory: str | Path, *, check: bool = True) -> Results:
     directory = Path(directory)
     settle(directory)
     if not os.path.exists(directory / CSV_NAME):  # unlike Path.exists, it never raises
-        raise InputError(f"holds no {CSV_NAME}", directory, "give a folder that `tkamb run` wrote")
+        hint = "give a folder that `tkamb run` wrote"
+        if os.path.exists(scene := directory / "scene.toml"):
+            hint = f"run its scene first (`tkamb run {scene}`), and give the output folder"
+        raise InputError(f"holds no {CSV_NAME}", directory, hint)
     columns = read_csv(directory / CSV_NAME)
     if not len(next(iter(columns.values()), ())):
         raise InputError("holds no frame", directory / CSV_NAME, "run it again")

@@ -16,6 +16,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from tkamb.errors import InputError
+
 PACKAGE = Path(__file__).parents[1]
 SUFFIX = "Settings"
 
@@ -143,6 +145,9 @@ def _settings(options: argparse.Namespace) -> int:
         for row in all_settings()
         if all(word in f"{row.name} {row.algorithm} {row.meaning}".lower() for word in words)
     ]
+    if not rows:
+        hint = "`tkamb settings` prints all settings"
+        raise InputError(f"no setting contains {' and '.join(options.words)}", hint=hint)
     if options.json:
         print(json.dumps({row.name: asdict(row) for row in rows}, indent=2))
         return 0

@@ -427,8 +427,11 @@ def chosen_frames(frames: slice | range | None, count: int) -> range:
     ends = [end for end in (frames.start, frames.stop) if end is not None]
     chosen = range(count)[frames] if frames.step != 0 else range(0)
     if any(not -count <= end <= count for end in ends) or len(chosen) == 0:
+        start, stop, step = (
+            "" if part is None else part for part in (frames.start, frames.stop, frames.step)
+        )
         raise InputError(
-            f"frames {frames.start}:{frames.stop}:{frames.step} are not in the motion",
+            f"frames {start}:{stop}{'' if step == '' else f':{step}'} are not in the motion",
             "frames",
             f"it has frames 0 to {count - 1}; all are 0:{count}",
         )

@@ -189,6 +189,9 @@ def _gait(case: Case) -> dict[str, Any]:
     """Return gait events and stances from the force plates, and the gait cycle."""
     inputs: dict[str, Any] = {}
     cycle = case.gait_cycle_s
+    if cycle is None and case.motion.cycle_percent is None and case.scene.output.axis == "cycle":
+        # Without a known cycle the whole motion is one, also if only some frames are computed.
+        cycle = (float(case.motion.time[0]), float(case.motion.time[-1]))
     if cycle is not None:
         inputs["cycle_percent_s"] = list(cycle)
     gait = None if case.ground is None else case.ground.gait

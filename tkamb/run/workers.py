@@ -225,7 +225,9 @@ class PoolOptions:
     def __post_init__(self) -> None:
         if not 1 <= self.workers <= WORKER_LIMITS.max_workers:
             raise InputError(
-                f"{self.workers} is not within 1 to {WORKER_LIMITS.max_workers}", "workers"
+                f"cannot be {self.workers}",
+                "workers",
+                f"give a number from 1 to {WORKER_LIMITS.max_workers}",
             )
 
     def check(self) -> None:

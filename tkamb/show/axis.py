@@ -101,7 +101,7 @@ def horizontal_axis(results: "Results", kind: str | None = None) -> HorizontalAx
     if np.isfinite(percent).all():
         return HorizontalAxis(kind, percent, _stances_in_cycle(results))
     start, end = results.summary.get("cycle_percent_s") or (time[0], time[-1])
-    percent = 100 * (time - start) / (end - start)
+    percent = 100 * (time - start) / (end - start) if end > start else np.zeros(len(time))
     if percent.max() > 100 + 1e-6 or percent.min() < -1e-6:
         percent = percent % 100
     return HorizontalAxis(kind, percent, _stances_in_cycle(results))

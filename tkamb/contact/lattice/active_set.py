@@ -4,10 +4,10 @@ Find the normal forces lambda (and the approach D) such that, for every candidat
 
     gamma = gap + A lambda + D c >= 0,   lambda >= 0,   gamma lambda = 0
 
-Either D is given or the load is: -cᵀ lambda = load. A is the compliance along the normals,
-symmetric and positive definite; c has the y of the normals. Primal-dual active set (Hintermueller,
-Ito & Kunisch, SIAM J Optim 13:865, 2002, doi:10.1137/S1052623401383558). Once a set recurs, only
-the node with the largest violation changes. The search ends after twice as many sets as candidates.
+Either D or the load -cᵀ lambda is given. A is the compliance along the femoral normals, symmetric
+and positive definite. c holds the y of these normals. Primal-dual active set (Hintermueller, Ito &
+Kunisch, SIAM J Optim 13:865, 2002, doi:10.1137/S1052623401383558). Once a set recurs, only the node
+with the largest violation changes. The search stops after twice as many sets as candidates.
 """
 
 from dataclasses import dataclass

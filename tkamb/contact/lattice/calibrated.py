@@ -32,7 +32,7 @@ from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.threads import in_halves
 
 LEAST_DIVISOR = 1e-300
-"""m²: smallest divisor. It avoids a division by zero."""
+"""m²: smallest divisor, against division by zero."""
 
 
 @compiled
@@ -85,7 +85,7 @@ def _split_displacement(
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
     """Return the mean gradient G = sum u_i g_iᵀ of a cell row by row; write u and u - G x.
 
-    The eight corners of an axis lie side by side, so that they fill the processor's vector
+    The eight values of an axis are adjacent in memory, so that they fill the processor's vector
     registers. G is in nine registers. The arguments are those of `_shear_force`.
     """
     first = nodes[0]
@@ -268,8 +268,8 @@ def cell_forces(
 
     Args:
         bulk_modulus: K, Pa.
-        residuals: (mu - mu_s) K_d u of each cell, N, shape (c, 24), written: the force that the
-            linear solid carries in excess.
+        residuals: overwritten by (mu - mu_s) K_d u of each cell, N, shape (c, 24). The linear solid
+            carries this force in excess.
         internal: nodal forces, N, shape (n, 3). mu_s K_d u + K V g (g · u) of the cells is added.
     """
     u, excess, force = np.empty((3, 8)), np.empty((3, 8)), np.empty((3, 8))

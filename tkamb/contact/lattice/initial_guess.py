@@ -19,7 +19,7 @@ class LatticeStart(WarmStart):
         problem: the problem that was solved. Other problems ignore the warm start.
         loads: nonlinear loads h + r, N, shape (n, 3); None for a linear material.
         displacement: displacement of the contact nodes, m, shape (c, 3); 0 except at candidates.
-        depth: distance of the femoral component below the lowest contact node, m.
+        depth: travel of the femoral component since it touched the first contact node, m.
         region: elements outside of which h is zero, or None.
         softening: s, see `Residual`.
     """
@@ -43,12 +43,12 @@ class InitialGuess:
     """The state at which the iteration begins.
 
     Args:
-        candidates: positions among the contact nodes of those that may be in contact, shape (m,).
+        candidates: positions of the candidates among the contact nodes, shape (m,).
         response: displacements of the candidates under forces on them.
         active: first guess of the active set, shape (m,).
         planes: femoral planes over the undeformed candidates.
         loads: nonlinear loads h of an earlier solution, N, shape (n, 3), or None.
-        displacement: of the candidates in an earlier solution, m, shape (m, 3), or None.
+        displacement: candidates' displacement in an earlier solution, m, shape (m, 3), or None.
         reach: vertical gap below which every node is a candidate, m.
         region: elements outside of which h is zero, or None.
         offset: creep displacement of the candidates of a linear material, m, shape (m, 3), or

@@ -182,7 +182,7 @@ class CellContact(ContactModel):
             pose: pose_femoral_in_insert, shape (4, 4).
             start: an earlier result, or its warm start.
             forces_only: whether only the forces are needed. Then only the region of the warm start
-                is evaluated, areas are those of whole nodes, and nothing is flagged. This is
+                is evaluated, contact areas count whole nodes, and nothing is flagged. This is
                 accurate near the pose of the warm start (`LatticeProbe`).
         """
         pose = np.array(pose, float)
@@ -361,7 +361,7 @@ class FiniteElements(CellContact):
 
 
 def _with_start(result: ContactResult) -> tuple[ContactResult, WarmStart]:
-    """Return a result without a lattice solution, and the warm start that it gives alone."""
+    """Return a result, and the warm start made from it without a lattice solution."""
     return result, WarmStart.after(result)
 
 
@@ -374,7 +374,7 @@ def _start_after(
         state: prepared contact.
         contact: pose, pressure and gap of the solution.
         solution: solution of the lattice.
-        depth: distance of the femoral component below the lowest contact node, m.
+        depth: travel of the femoral component since it touched the first contact node, m.
     """
     displacement = np.zeros_like(state.surface.points)
     displacement[solution.candidates] = solution.displacement

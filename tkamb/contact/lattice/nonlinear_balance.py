@@ -240,7 +240,10 @@ class NonlinearBalance:
 
 
 def forces_of(solid: Solid, field: Array) -> tuple[Array, Array, float]:
-    """Return f_int(u) (n, 3), each element's share of h (k, 3p), N, and the softening s at u."""
+    """Return f_int(u) (n, 3), N, the elements' shares of h (k, 3p), N, and the softening s at u.
+
+    An element has p nodes.
+    """
     internal, shares, tangent_work = solid.forces(field)
     work = float(np.vdot(internal, field))
     return internal, shares, work / max(tangent_work, 1e-3 * abs(work), 1e-300)
@@ -249,7 +252,7 @@ def forces_of(solid: Solid, field: Array) -> tuple[Array, Array, float]:
 def accelerated(iterates: list[tuple[Array, Array]]) -> Array:
     """Return the next x of a fixed-point iteration x = g(x), by Anderson's method.
 
-    It combines the iterates so that the linearised residual is smallest.
+    The method combines the iterates so that the linearised residual is smallest.
 
     Args:
         iterates: pairs of g(x) and g(x) - x, shape (n,) each, the newest last.

@@ -8,7 +8,7 @@ nodes,
 
 G is the gradient of the femoral normal along the surface. The nodes are assumed to move along the
 normal only, so that the femur slides over them. C belongs to the linear material, and the active
-set is constant. The real contact differs from both. So the forces come from `evaluate`, and the
+set is constant. The real contact differs in both. So the forces come from `evaluate`, and the
 stiffness only gives the direction of a search.
 """
 
@@ -31,7 +31,7 @@ REGION_HOLDS_WITHIN = 0.1
 the region is evaluated, in half the time. The residual of the whole solid is then at most 1.2 times
 the tolerance (`tests/test_lattice_probe.py`)."""
 REGION_HOLDS_TO = 1.1
-"""1: largest ratio of the contact forces to those at that pose, with the region alone."""
+"""1: largest ratio of the contact force to that of the last evaluation of the whole solid."""
 LEVER_ARM = 0.03
 """m: distance from the femoral axis to the contact. It converts a rotation to a distance."""
 

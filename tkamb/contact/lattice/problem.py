@@ -21,7 +21,7 @@ from tkamb.geometry.surface import Surface
 Direction = Literal["normal", "vertical"]
 
 LEAST_NORMAL_Y = -0.05
-"""1: largest y of a femoral normal that can be loaded. It is 87 deg from straight down."""
+"""1: femoral normals with a larger y carry no load. The limit is 87 deg from straight down."""
 UP = np.array([0.0, 1.0, 0.0])
 
 

@@ -45,8 +45,8 @@ class LatticeFlagSettings:
     """1: a result with a smaller principal strain is flagged. Chosen because the material law does
     not prevent strains below -1, and measured curves end before -0.4."""
     max_unseen_height: float = 0.2e-3
-    """m: a press is flagged if first touch lies this far above the first contact node. Chosen
-    because the nodes of 3 mm cells miss the bottom of a ball of 15 mm radius by 0.15 mm."""
+    """m: a press is flagged if its travel from first touch to the first contact node is larger.
+    Chosen because the nodes of 3 mm cells miss the bottom of a ball of 15 mm radius by 0.15 mm."""
     collapse_strain: float = -1.0
     """1: principal strain at which a cell has no thickness left. The result is then out of range.
     By definition of the strain."""
@@ -104,7 +104,7 @@ def edge_flags(
     sharpness = zip(peaks, map(_sharpness, normals), strict=True)
     return tuple(
         f"the {side} peak pressure lies at an edge of the femoral component, which {words} "
-        f"within {distance.max() / MILLIMETRE:.2g} mm: it rises as cells shrink"
+        f"within {distance.max() / MILLIMETRE:.2g} mm: the peak rises as cells shrink"
         for side, words in sharpness
         if words
     )
@@ -140,12 +140,12 @@ def strain_flags(state: LatticeState, solution: Solution) -> tuple[tuple[str, ..
 
 
 def unseen_flags(state: LatticeState, result: ContactResult, depth: float) -> Iterator[str]:
-    """Yield a flag if the meshes touch far above the first contact node.
+    """Yield a flag if the meshes touch long before any node does.
 
     Args:
         state: prepared contact.
         result: result of a press.
-        depth: distance of the femoral component below the first contact node, m.
+        depth: travel of the femoral component since it touched the first contact node, m.
     """
     unseen = result.approach - depth
     if unseen > max(
@@ -247,10 +247,10 @@ def _pressures(
 def _gaps(state: LatticeState, pose: Array, gaps: Array, force: Array, solution: Solution) -> Array:
     """Return the gaps (c,), m.
 
-    They belong to the deformed insert in and beside the contact and where the undeformed bodies
-    overlap, and to the undeformed insert elsewhere. Which nodes are candidates depends on the
-    initial guess. So the gap of a node beside the contact is computed even if it is no candidate:
-    the edge of contact depends on it.
+    Gaps of the deformed insert are used in and beside the contact, and where the undeformed bodies
+    overlap. Elsewhere the insert is undeformed. The edge of contact depends on the gaps beside the
+    contact, but the candidates depend on the initial guess. So the gap of a node beside the contact
+    is computed even if it is no candidate.
 
     Args:
         state: prepared contact.

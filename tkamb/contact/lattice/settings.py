@@ -15,8 +15,8 @@ class LatticeSolverSettings:
     norms over the free unknowns). Smaller: more passes. Larger: fewer passes, nodal forces less
     accurate. Chosen above the rounding residual: if `tolerance` is 1e-3 or more, the factor is
     stored in 16-bit integers. Their rounding leaves a residual of 4e-4 (2 mm) to 1.2e-3 (1 mm) on
-    the shipped knee, which passes on the region cannot remove. Its work is below 1e-5. A larger
-    one (2.6e-3 at 16 kN and 1 mm) is removed by passes on the whole solid."""
+    the shipped knee, which passes on the region cannot remove. Its work is below 1e-5. Passes
+    on the whole solid remove a larger residual (2.6e-3 at 16 kN and 1 mm)."""
     work_tolerance: float = 3e-4
     """1: largest work of the residual force on the displacement, relative to the work of the
     contact forces, times the softening. It estimates the relative error of the approach (energy
@@ -31,8 +31,7 @@ class LatticeSolverSettings:
     max_passes: int = 40
     """Largest number of passes, and of steps of the full Newton iteration. Knees take 1 to 8
     passes. Smaller: slow presses need the full Newton iteration, or do not converge. Larger: more
-    of them converge, but a press that cannot converge takes longer. It has no effect on presses
-    that converge earlier."""
+    of them converge, but a press that cannot converge takes longer."""
     anderson_depth: int = 6
     """Number of differences that Anderson's method uses. Smaller: more passes of a softened
     contact. Larger: fewer passes, more memory."""
@@ -47,8 +46,7 @@ class LatticeSolverSettings:
     max_expansions: int = 8
     """Largest number of candidate sets. A press is repeated with more candidates if its approach
     goes beyond them. Smaller: a press fails (out of range) if its expected approach was far too
-    small. Larger: it is repeated more often before it fails. It has no effect on presses that need
-    fewer sets."""
+    small. Larger: it is repeated more often before it fails."""
 
 
 LATTICE_SOLVER = LatticeSolverSettings()

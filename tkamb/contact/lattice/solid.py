@@ -6,7 +6,7 @@ eps = e + sigma/(9 K), with the equivalent deviatoric strain e and the bulk modu
     q(e) = sigma(eps),   e = eps - sigma(eps)/(9 K),   3 mu_s = q(e)/e
 
 reproduces sigma(eps) exactly. e grows with eps, because the tangent modulus is at most E and
-E/(9 K) = (1 - 2 nu)/3 < 1. Strains are engineering strains of the undeformed shape.
+E/(9 K) = (1 - 2 nu)/3 < 1. Strains are engineering strains.
 """
 
 from abc import ABC, abstractmethod
@@ -309,7 +309,7 @@ class Solid(ABC):
 
     @abstractmethod
     def linear_force(self, displacement: Array) -> Array:
-        """Return K u, N, (n, 3), summed element by element: no matrix is assembled."""
+        """Return K u, N, (n, 3), summed element by element."""
 
     def least_principal_strain(self, displacement: Array) -> float:
         """Return the smallest principal strain of the mean strains of all cells.

@@ -25,14 +25,14 @@ the gap with new rays at the displaced nodes. The iteration has converged when
     s |r · u| / (f · u) <= work_tolerance,    s = (f_int(u) · u) / (uᵀ K_T u)
     |gamma| / max |u| <= gap_tolerance        for active nodes, and for penetrations of others
 
-and the active set has stopped changing. The result reports these residuals. The second estimates
-the relative error of the approach, because an error du = e u leaves r = e K_T u. The load and
-lambda >= 0 hold to rounding in every pass.
+and the active set has stopped changing. The result reports these residuals. The second residual
+estimates the relative error of the approach, because an error du = e u leaves r = e K_T u. The load
+and lambda >= 0 hold to rounding in every pass.
 
 After `max_passes` an iteration that began with the loads h of an earlier solution begins again
 without them. If this does not converge either, `solve_by_newton` continues. This full Newton
 iteration is also the reference: every step factorises the tangent stiffness, and solves the
-contact on the compliance of this tangent. The two share only the contact conditions.
+contact on the compliance of this tangent. The two iterations share only the contact conditions.
 """
 
 from dataclasses import dataclass, replace
@@ -176,7 +176,7 @@ class SlidingNodes:
     Args:
         problem: solid and femoral component.
         points: undeformed candidates, m, shape (m, 3).
-        displacement: their first displacement, m, shape (m, 3).
+        displacement: their initial displacement, m, shape (m, 3).
         pose: pose_femoral_in_insert, shape (4, 4).
         planes: femoral planes over the undeformed candidates.
     """

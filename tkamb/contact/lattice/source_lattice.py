@@ -7,8 +7,8 @@ Linear: a unit displacement of the nodes in contact gives the slope of the react
 correction of the approach D then gives the load, if the contact set does not change.
 Nonlinear: at fixed D, Newton steps with the tangent springs bring the free nodes to equilibrium.
 Then D_new = D (load/F)^(1/m). Sharma (2008) has m = 1. This oscillates without end if F grows with
-the square of D or faster, as it does while nodes come into contact. So m is the exponent of this
-growth between the last two D.
+the square of D or faster, as it does while nodes come into contact. So tkamb takes the exponent of
+this growth between the last two D as m.
 Sharma (2008) does not define what happens to nodes in tension. tkamb releases them, and adds nodes
 that the femoral component penetrates.
 
@@ -20,8 +20,8 @@ Z = L⁻¹ E (the columns of E are their unit forces). With these,
 
 is the inverse of K on the free unknowns. A prescribed displacement d of the held unknowns displaces
 the lattice by L⁻ᵀ Z (ZᵀZ)⁻¹ d. The tangent stiffness differs from K only in the few springs that
-have softened. The conjugate gradient method, preconditioned by P, therefore solves with it in a few
-iterations (Saad 2003, section 9.2). The rounding of the stored factor changes only their number.
+have softened. So the conjugate gradient method, preconditioned by P, needs few iterations (Saad
+2003, section 9.2). The rounding of the stored factor changes only the number of iterations.
 """
 
 from dataclasses import dataclass, replace

@@ -3,7 +3,7 @@
 Every node is joined to its 26 neighbours. C, m, is calibrated so that a uniformly strained cell has
 Young's modulus E in the superior-inferior direction. 13 springs belong to the volume of a cell, so
 
-    C_ijkl = (k/V) sum over 13 springs of L² n_i n_j n_k n_l,   k = E / (E of unit k)
+    C_ijkl = (k/V) sum over 13 springs of L² n_i n_j n_k n_l,   k = E / (E at k = 1)
 
 (Sharma's sum has 26 springs per cell and counts each twice). On a cube of edge a, k = E a/2.7.
 Poisson's ratio is 0.35 for every material. Springs on the surface have the same k although fewer

@@ -138,9 +138,9 @@ def download(dataset: Dataset, to: Path, url: str | None = None) -> Got:
     pooch.get_logger().setLevel("ERROR")
     base = url or dataset.url
 
-    def fetch(file: DataFile, beside: Path) -> Path | None:
+    def fetch(file: DataFile, scratch: Path) -> Path | None:
         address = file.url(base)
-        return _retrieved(address, file, beside) if address else None
+        return _retrieved(address, file, scratch) if address else None
 
     return _get(dataset, to, fetch)
 
@@ -164,12 +164,12 @@ def take_from(dataset: Dataset, to: Path, folder: Path) -> Got:
         raise InputError("is not a folder", folder, "give the folder of what you downloaded")
 
     sources = {
-        file.name: _found(file, folder) for file in dataset.files
+        file.name: _verified_copy(file, folder) for file in dataset.files
     }  # search all files before copying any
     if not any(sources.values()):
         hint = f"download or clone {dataset.repository} first"
         raise InputError("holds none of the files of this data set", folder, hint)
-    return _get(dataset, to, lambda file, beside: sources[file.name])
+    return _get(dataset, to, lambda file, _: sources[file.name])
 
 
 def _get(dataset: Dataset, to: Path, fetch: Callable[[DataFile, Path], Path | None]) -> Got:
@@ -183,8 +183,8 @@ def _get(dataset: Dataset, to: Path, fetch: Callable[[DataFile, Path], Path | No
     missing = [file for file in dataset.files if not _is_there(file, to)]
     got = Got(kept=[file.name for file in dataset.files if file not in missing])
     for file in missing:
-        with tempfile.TemporaryDirectory(prefix="tkamb-data-") as beside:
-            source = fetch(file, Path(beside))
+        with tempfile.TemporaryDirectory(prefix="tkamb-data-") as scratch:
+            source = fetch(file, Path(scratch))
             if source is None:
                 got.absent.append(file.name)
                 continue
@@ -212,7 +212,7 @@ def _retrieved(address: str, file: DataFile, folder: Path) -> Path:
         status = error.response.status_code if error.response is not None else "unknown"
         raise InputError(f"cannot be downloaded (HTTP status {status})", address, hint) from None
     except RequestException as error:
-        what = type(error).__name__  # its text is a page of nested causes
+        what = type(error).__name__  # The error's text is a page of nested causes.
         raise InputError(f"cannot be downloaded (no network? {what})", address, hint) from None
     except OSError as error:
         raise InputError(f"cannot be downloaded ({error.strerror})", address, hint) from None
@@ -253,7 +253,7 @@ class _LimitedDownload:
                 file.write(chunk)
 
 
-def _found(file: DataFile, folder: Path) -> Path | None:
+def _verified_copy(file: DataFile, folder: Path) -> Path | None:
     """Return the path of a file in a folder of downloads, or None."""
     copies = [place for place in file.places(folder) if place.is_file()]
     for place in copies:

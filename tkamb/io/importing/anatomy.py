@@ -137,10 +137,12 @@ def _joints(
     groups = _rigid_groups(model)
     femur = _ordered(model, groups[knee.inboard], "fem")
     tibia = _ordered(model, groups[knee.outboard], "tib")
-    hip = _one(model, [j for j in _moving(model) if j.outboard in femur], "above the femur", femur)
+    hip = _single_joint(
+        model, [j for j in _moving(model) if j.outboard in femur], "above the femur", femur
+    )
     below = [j for j in _moving(model) if j.inboard in tibia]
     ankles = [j for j in below if "ankle" in j.name.lower()]
-    ankle = _one(
+    ankle = _single_joint(
         model, ankles or [j for j in below if not _is_patella(j)], "below the tibia", tibia
     )
     return knee, hip, ankle, femur, tibia
@@ -154,10 +156,10 @@ def _unread_joint(model: OpenSimModel, bodies: Iterable[str] = ()) -> InputError
         bodies: the joint must concern one of these bodies; empty: any joint counts.
     """
     names = {joint.name for joint in model.joints}
-    for one in model.unread:
-        of_these = not bodies or one.concerns & {*bodies}
-        if one.kind.endswith("Joint") and one.name not in names and of_these:
-            return InputError(one.reason)
+    for element in model.unread:
+        concerned = not bodies or element.concerns & {*bodies}
+        if element.kind.endswith("Joint") and element.name not in names and concerned:
+            return InputError(element.reason)
     return None
 
 
@@ -168,24 +170,25 @@ def _refuse_unread(model: OpenSimModel, joints: Iterable[Joint], bodies: set[str
             raise _unread_joint(model, [joint.outboard]) or InputError(joint.unread)
     within = {j.name for j in model.joints if {*_ends(j)} & bodies}
     coordinates = {c.name for c in model.coordinates.values() if c.joint in within}
-    in_the_tree = {joint.name for joint in model.joints}
-    for one in model.unread:
-        if one.constrains and one.name not in in_the_tree and one.concerns & (bodies | coordinates):
-            raise InputError(one.reason)
+    tree_joints = {joint.name for joint in model.joints}
+    for element in model.unread:
+        is_in_tree = element.name in tree_joints
+        if element.constrains and not is_in_tree and element.concerns & (bodies | coordinates):
+            raise InputError(element.reason)
 
 
 def way_to_pelvis(leg: Leg) -> list[Joint]:
     """Return the joints from the body above the hip down to ground."""
     carrier = {joint.outboard: joint for joint in leg.model.joints}
-    way, body = [], leg.pelvis
+    joints, body = [], leg.pelvis
     while body in carrier:
-        way.append(carrier[body])
+        joints.append(carrier[body])
         body = carrier[body].inboard
-    return way
+    return joints
 
 
 def _check_lengths(leg: Leg) -> None:
-    """Raise an InputError if the thigh or shank has no human length, so the knee joint is wrong."""
+    """Raise an InputError if thigh or shank has no human length: the knee joint is then wrong."""
     centre = leg.knee_centre
     for name, (other, point) in {"thigh": leg.hip_centre, "shank": leg.ankle_centre}.items():
         length = float(np.linalg.norm(transform(leg.neutral[other], point) - centre))
@@ -206,24 +209,26 @@ def _knee(model: OpenSimModel, side: str, name: str | None) -> Joint:
     named = [
         j for j in _moving(model) if "knee" in j.name.lower() or "femorotibial" in j.name.lower()
     ]
-    own = [j for j in named if j.name.endswith(SUFFIX[side])]
-    if not own:  # names in a model of one leg may have no suffix
-        own = [j for j in named if not j.name.endswith(SUFFIX["right"] + SUFFIX["left"])]
-    if len(own) != 1:
-        result = f"{len(own)} joints" if own else "no joint"
+    matches = [j for j in named if j.name.endswith(SUFFIX[side])]
+    if not matches:  # names in a model of one leg may have no suffix
+        matches = [j for j in named if not j.name.endswith(SUFFIX["right"] + SUFFIX["left"])]
+    if len(matches) != 1:
+        result = f"{len(matches)} joints" if matches else "no joint"
         listed = ", ".join(j.name for j in named) or ", ".join(joints)
         raise InputError(
-            f"has {result} that could be the {side} knee", model.name, f"give --knee, of {listed}"
+            f"has {result} that could be the {side} knee",
+            model.name,
+            f"give --knee, one of {listed}",
         )
-    return own[0]
+    return matches[0]
 
 
 def _flexion(model: OpenSimModel, knee: Joint) -> Coordinate | None:
-    own = [model.coordinates[a.coordinate] for a in knee.rotations if a.coordinate]
-    for coordinate in own:
+    angles = [model.coordinates[a.coordinate] for a in knee.rotations if a.coordinate]
+    for coordinate in angles:
         if "flex" in coordinate.name or "angle" in coordinate.name:
             return coordinate
-    return own[0] if own else None
+    return angles[0] if angles else None
 
 
 def _moving(model: OpenSimModel) -> list[Joint]:
@@ -240,9 +245,9 @@ def _rigid_groups(model: OpenSimModel) -> dict[str, set[str]]:
     moving = _moving(model)
     for joint in model.joints:
         if joint not in moving:
-            both = groups[joint.parent] | groups[joint.child]
-            for body in both:
-                groups[body] = both
+            union = groups[joint.parent] | groups[joint.child]
+            for body in union:
+                groups[body] = union
     return groups
 
 
@@ -268,7 +273,9 @@ def _ends(joint: Joint) -> tuple[str, str]:
     return joint.parent, joint.child
 
 
-def _one(model: OpenSimModel, joints: list[Joint], where: str, bodies: Iterable[str]) -> Joint:
+def _single_joint(
+    model: OpenSimModel, joints: list[Joint], where: str, bodies: Iterable[str]
+) -> Joint:
     joints = [joint for joint in joints if not _is_patella(joint)]
     if len(joints) != 1:
         result = ", ".join(j.name for j in joints) or "none"

@@ -132,32 +132,32 @@ def _from_table(
     time = table.time()
     span = (float(time[0]), float(time[-1]))
     notices = [f"notice: {path.name}: {notice}" for notice in table.notices]
-    own_axes = _axes_of_table(table, forces, axes)
-    if own_axes != axes:
-        notices.append(f"{path.name}: y points up; forward, up, right are its {own_axes}")
-        axes = own_axes
+    table_axes = _axes_of_table(table, forces, axes)
+    if table_axes != axes:
+        notices.append(f"{path.name}: y points up; forward, up, right are its {table_axes}")
+        axes = table_axes
     if request.plates is not None:
         raise InputError("is for the plates of a .c3d", "--plates", "give --grf-force for a table")
     chosen = _named(forces, side, request.grf_force, table)
     if chosen:
         why = "as given" if request.grf_force else "by their name"
-        recorded = [_recorded(table, one, axes) for one in chosen] if len(chosen) > 1 else []
+        recorded = [_recorded(table, force, axes) for force in chosen] if len(chosen) > 1 else []
         ground = _table_file(path, axes, chosen, recorded)
         lines = [_columns_line(path, side, chosen, why), *notices]
         return FoundGround(ground, request.interval, span, lines)
     has_places = all(force.has("point") or force.has("moment") for force in forces)
     if feet is None or not forces or not has_places:
         raise _which_foot(forces, side, table)
-    recorded = [_recorded(table, one, axes) for one in forces]
+    recorded = [_recorded(table, force, axes) for force in forces]
     loads = feet_loads(recorded, feet)
-    own = own_plates(loads, side, path, "give --grf-force")
-    interval = request.interval or known_interval(loads, own, feet)
-    chosen = [one for one in forces if one.name in own]
-    under = [one for one in recorded if one.key in own]
+    names = own_plates(loads, side, path, "give --grf-force")
+    interval = request.interval or known_interval(loads, names, feet)
+    chosen = [force for force in forces if force.name in names]
+    foot_forces = [force for force in recorded if force.key in names]
     lines = [*(_load_line(load) for load in loads), _interval_line(request, interval)]
-    lines += [_columns_line(path, side, chosen, "by where they act"), *notices]
-    lines += [*_unmeasured_line(loads, own, feet, side, interval), *_drift_lines(recorded, own)]
-    return FoundGround(_table_file(path, axes, chosen, under), interval, span, lines)
+    lines += [_columns_line(path, side, chosen, "by their points of application"), *notices]
+    lines += [*_unmeasured_line(loads, names, feet, side, interval), *_drift_lines(recorded, names)]
+    return FoundGround(_table_file(path, axes, chosen, foot_forces), interval, span, lines)
 
 
 def _axes_of_table(table: Table, forces: list[TableForce], axes: str) -> str:
@@ -176,8 +176,8 @@ def _axes_of_table(table: Table, forces: list[TableForce], axes: str) -> str:
     forceplate_axes = {"x": "+x", "z": "+y", "y": "-z"}
     result = []
     for axis in axes.split(","):
-        own = forceplate_axes[axis[-1]]
-        result.append(("+" if own[0] == axis[0] else "-") + own[1])
+        table_axis = forceplate_axes[axis[-1]]
+        result.append(("+" if table_axis[0] == axis[0] else "-") + table_axis[1])
     return ",".join(result)
 
 
@@ -190,15 +190,15 @@ def _named(
         chosen = []
         for name in source_name.split(","):
             plain = name.strip().removesuffix("_v").rstrip("_")
-            own = [force for force in forces if force.name == plain]
-            if len(own) != 1:
+            matches = [force for force in forces if force.name == plain]
+            if len(matches) != 1:
                 raise InputError(
                     f"has no force '{name.strip()}' (it has {names})", table.path, "--grf-force"
                 )
-            chosen += own
+            chosen += matches
         return chosen
-    own = [f for f in forces if re.search(rf"(^|_){side[0]}(_|$)|{side}", f.name.lower())]
-    return own if len(own) == 1 else []
+    matches = [f for f in forces if re.search(rf"(^|_){side[0]}(_|$)|{side}", f.name.lower())]
+    return matches if len(matches) == 1 else []
 
 
 def _which_foot(forces: list[TableForce], side: str, table: Table) -> InputError:
@@ -222,8 +222,8 @@ def _recorded(table: Table, force: TableForce, axes: str) -> RecordedForce:
         unloaded_N=IMPORTED_FORCE.hold_below,
     )
     time, wrench, level = recorded_wrench(source)
-    on = around_load(np.linalg.norm(wrench[:, :3], axis=1), time)
-    drift = unloaded_level(wrench[:, 1], on, time)
+    loaded = around_load(np.linalg.norm(wrench[:, :3], axis=1), time)
+    drift = unloaded_level(wrench[:, 1], loaded, time)
     return RecordedForce(force.name, f"force {force.name}", time, wrench, level, drift)
 
 
@@ -236,8 +236,8 @@ def _table_file(
     table.
     """
     if len(chosen) == 1:
-        own = chosen[0].columns
-        columns = (("time", "time"), *((role, own[role]) for role in COLUMNS[1:] if role in own))
+        names = chosen[0].columns
+        columns = (("time", "time"), *((k, names[k]) for k in COLUMNS[1:] if k in names))
         return GroundFile(path, axes, (), columns, "m")
     return GroundFile(path, "+x,+y,+z", (), (), "m", made=_summed(recorded, path))
 
@@ -245,11 +245,11 @@ def _table_file(
 def _summed(recorded: list[RecordedForce], path: Path) -> str:
     """Return a table of the summed forces as CSV. A force below the load threshold is zero."""
     time = recorded[0].time
-    levels = [one.level for one in recorded]
+    levels = [force.level for force in recorded]
     wrenches = []
-    for one in recorded:
-        on = around_load(np.linalg.norm(one.wrench[:, :3], axis=1), time)
-        wrenches.append(np.where(on[:, None], one.wrench, 0.0))
+    for source in recorded:
+        loaded = around_load(np.linalg.norm(source.wrench[:, :3], axis=1), time)
+        wrenches.append(np.where(loaded[:, None], source.wrench, 0.0))
     level = float(np.mean(levels))
     point, moment, force = summed_reaction(time, wrenches, level, IMPORTED_FORCE.hold_below, path)
     rows = np.column_stack([time, force, point, moment])
@@ -297,10 +297,10 @@ def _load_line(load: Load) -> str:
             f"ATTENTION: {load.title}: loaded from {load.start:.3f} to {load.end:.3f} s, and no "
             "foot's markers are near: not used"
         )
-    other = "" if np.isnan(load.other) else f", {load.other * 1e3:.0f} mm from the other's"
+    other = "" if np.isnan(load.other) else f", {load.other * 1e3:.0f} mm from the other foot's"
     step = (
-        f"; the foot stands on a step, about {load.surface:.2f} m above the plate: the wrench is "
-        "taken as it is, with its point on that level"
+        f"; the foot stands on a step, about {load.surface:.2f} m above the plate: the measured "
+        "wrench is kept, with its point of application at that height"
         if load.surface
         else ""
     )
@@ -329,10 +329,10 @@ def _unmeasured_line(
 
 def _drift_lines(forces: list[RecordedForce], plates: tuple[int | str, ...]) -> list[str]:
     return [
-        f"ATTENTION: {one.title} reads {one.drift:.1f} N while nobody stands on it: it drifts, and "
-        "its force under the foot is too large by that amount"
-        for one in forces
-        if one.key in plates and abs(one.drift) > PLATE_LOAD.drift_N
+        f"ATTENTION: {force.title} reads {force.drift:.1f} N while nobody stands on it: it drifts, "
+        "and its force under the foot is too large by that amount"
+        for force in forces
+        if force.key in plates and abs(force.drift) > PLATE_LOAD.drift_N
     ]
 
 

@@ -65,7 +65,8 @@ def mesh_frame(leg: Leg, part: str, wished_name: str | None) -> MeshFrame:
     Args:
         leg: the leg.
         part: "femoral component", "insert" or "patellar button".
-        wished_name: name of the offset frame or body; None: the first with the part in its name.
+        wished_name: name of the offset frame or body; None: the first frame with the part in its
+            name.
 
     Raises:
         InputError: no frame has this name, or no frame has the part in its name.
@@ -103,7 +104,7 @@ def mesh_frame(leg: Leg, part: str, wished_name: str | None) -> MeshFrame:
 
 
 def quarter_turn(rotation: Array) -> tuple[Array, float]:
-    """Return the nearest rotation (3, 3) that maps axes onto axes, and its distance, rad."""
+    """Return the nearest rotation (3, 3) by multiples of 90 deg, and the angle to it, rad."""
     turns = Rotation.create_group("O")
     angles = (turns.inv() * Rotation.from_matrix(rotation)).magnitude()
     nearest = int(np.argmin(angles))
@@ -143,13 +144,13 @@ class Links:
             InputError: no link moves with the body.
         """
         leg = self.leg
-        for link, bodies, own in (
+        for link, bodies, link_pose in (
             ("femur", leg.femur, self.femur),
             ("tibia", leg.tibia, self.tibia),
             ("patella", (leg.patella,), self.patella),
         ):
-            if body in bodies and own is not None:
-                return link, inverse(own) @ leg.in_body(body, str(bodies[0]))
+            if body in bodies and link_pose is not None:
+                return link, inverse(link_pose) @ leg.in_body(body, str(bodies[0]))
         raise InputError(f"body '{body}' is not part of any link of the leg", leg.model.name)
 
     def point_in_link(self, body: str, point: Array) -> tuple[str, Array]:
@@ -192,8 +193,8 @@ def find_links(
 
     Args:
         leg: the leg.
-        placement: pose in the insert frame of the insert's mesh, turned to anatomical axes about
-            the mesh origin, shape (4, 4); None without an implant.
+        placement: pose of the insert's mesh in the insert frame, after the mesh is turned to
+            anatomical axes about its origin, shape (4, 4); None without an implant.
         axes: axes of the meshes that point anterior, superior and right.
         frames: part of the implant -> name of its mesh's frame; None: inferred from the names.
         with_button: whether the implant has a patellar button.
@@ -213,7 +214,7 @@ def find_links(
     if placement is None:
         straight = inverse(leg.neutral[leg.tibia[0]] @ tibia) @ leg.neutral[leg.femur[0]] @ femur
         insert_in_tibia = pose(np.eye(3), straight[:3, 3])
-        text.append("no implant: the 'insert' frame is the tibia's at the knee's centre")
+        text.append("no implant: the 'insert' frame has the tibia's axes at the knee's centre")
     else:
         result = mesh_frame(leg, "insert", frames.get("insert"))
         mesh = _anatomical(leg, result, leg.tibia[0], turn, "insert", text)
@@ -298,14 +299,16 @@ def link_inertias(links: Links, scale: float) -> dict[str, RigidInertia]:
         "femur": (leg.femur[0], links.femur, leg.femur),
     }
     return {
-        link: reduce(combined, (_seen_from(links, b, base, own, scale) for b in bodies))
-        for link, (base, own, bodies) in groups.items()
+        link: reduce(combined, (_body_inertia(links, b, base, link_pose, scale) for b in bodies))
+        for link, (base, link_pose, bodies) in groups.items()
     }
 
 
-def _seen_from(links: Links, body: str, base: str, own: Array, scale: float) -> RigidInertia:
-    """Return the inertia of a body in a link's frame. `own` is the link's pose in body `base`."""
-    pose = np.linalg.inv(own) @ links.leg.in_body(body, base)
+def _body_inertia(
+    links: Links, body: str, base: str, link_pose: Array, scale: float
+) -> RigidInertia:
+    """Return the inertia of a body in a link's frame, with the link's pose in body `base`."""
+    pose = np.linalg.inv(link_pose) @ links.leg.in_body(body, base)
     inertia, turn = links.leg.model.bodies[body], pose[:3, :3]
     tensor = scale * turn @ inertia.inertia @ turn.T
     return RigidInertia(scale * inertia.mass_kg, transform(pose, inertia.centre), tensor)
@@ -352,13 +355,13 @@ def _chain(
     """Return the URDF lines of a series of one-axis joints with massless links between them."""
     lines, parent = [], start
     for number, (name, (kind, axis)) in enumerate(joints.items(), 1):
-        # docs/patient.md: in a left knee the rotation axes x and y have the opposite sign
+        # In a left knee the rotation axes x and y have the opposite sign (docs/patient.md).
         reversed_axis = side == "left" and kind == "revolute" and axis[2] == 0
-        own = tuple(-v for v in axis) if reversed_axis else axis
+        signed_axis = tuple(-v for v in axis) if reversed_axis else axis
         child = end if number == len(joints) else f"{name}_link"
         lines += [f'  <link name="{child}"/>'] if child != end else []
         place = first if parent == start else np.eye(4)
-        lines += _joint(name, (kind, own), parent, child, place)
+        lines += _joint(name, (kind, signed_axis), parent, child, place)
         parent = child
     return lines
 

@@ -90,7 +90,7 @@ def seen_segments(
     in_foot = transform(leg.in_body(body, foot), ankle)
     hip_body, hip = leg.hip_centre
     in_pelvis = transform(leg.in_body(hip_body, leg.pelvis), hip)
-    needed = [
+    definitions = [
         ("shank", leg.tibia, "", None, None),
         ("thigh", leg.femur, "", None, None),
         ("foot", (foot,), "shank", np.zeros(3), in_foot),
@@ -98,18 +98,18 @@ def seen_segments(
     ]
     labels, dropped = _seen_labels(recorded, without)
     result = {}
-    for name, bodies, joined_to, joint, centre in needed:
-        own = {m.name: m for m in leg.model.markers.values() if m.body in bodies}
-        match = matched_labels(own, labels)
+    for name, bodies, joined_to, joint, centre in definitions:
+        body_markers = {m.name: m for m in leg.model.markers.values() if m.body in bodies}
+        match = matched_labels(body_markers, labels)
         points = {
-            match[m]: own[m].location
+            match[m]: body_markers[m].location
             if joined_to
-            else links.point_in_link(own[m].body, own[m].location)[1]
-            for m in own
+            else links.point_in_link(body_markers[m].body, body_markers[m].location)[1]
+            for m in body_markers
             if m in match
         }
-        left_out = matched_labels(own, dropped)
-        missing = tuple(m for m in own if m not in match and m not in left_out)
+        left_out = matched_labels(body_markers, dropped)
+        missing = tuple(m for m in body_markers if m not in match and m not in left_out)
         result[name] = ModelSegment(name, points, missing, joined_to, joint, centre)
     return result
 
@@ -130,7 +130,7 @@ def _seen_labels(recorded: Table, without: Sequence[str]) -> tuple[list[str], li
 
 
 def segments_of(recorded: Table, segments: list[ModelSegment]) -> list[ModelSegment]:
-    """Return the segments with the labels of another recording. They keep only its markers."""
+    """Return the segments with another recording's labels, without markers that it lacks."""
     labels = recorded_labels(recorded)
     result = []
     for segment in segments:
@@ -147,7 +147,7 @@ def _equal_line(recorded: Table) -> str:
 
 
 def _clashing_prefixes(labels: list[str], needed: Sequence[str]) -> list[str]:
-    """Return the prefixes of those needed markers that occur with several prefixes."""
+    """Return the prefixes of the needed markers that occur with several prefixes."""
     plain = {plain_label(name) for name in needed}
     result: dict[str, list[str]] = {}
     for label in labels:
@@ -269,5 +269,5 @@ def feet(leg: Leg, recorded: Table, other: str) -> dict[str, list[str]]:
 
 
 def _foot_labels(leg: Leg, labels: list[str]) -> list[str]:
-    own = [m.name for m in leg.model.markers.values() if m.body in leg.foot]
-    return list(matched_labels(own, labels).values())
+    names = [m.name for m in leg.model.markers.values() if m.body in leg.foot]
+    return list(matched_labels(names, labels).values())

@@ -27,8 +27,8 @@ class ModelFitSettings:
     """Settings of the fit of a model to markers."""
 
     block_frames: int = 128
-    """frames: number that is fitted in one call. It does not change the result. Chosen because the
-    arrays then fit into the processor's cache."""
+    """Number of frames that are fitted in one call. It does not change the result. Chosen because
+    the arrays then fit into the processor's cache."""
     coarse_stride: int = 8
     """frames: every `coarse_stride`-th frame is fitted first. Interpolation between these poses
     gives the initial guesses of the other frames. Chosen freely: it changes only these guesses."""
@@ -85,9 +85,9 @@ class ModelChain:
         return self._markers_at(self.kinematics.poses(state))
 
     def _markers_at(self, poses: Array) -> Array:
-        own = poses[:, self._at]
+        bodies = poses[:, self._at]
         return np.asarray(
-            np.einsum("fmij,mj->fmi", own[..., :3, :3], self._points) + own[..., :3, 3]
+            np.einsum("fmij,mj->fmi", bodies[..., :3, :3], self._points) + bodies[..., :3, 3]
         )
 
     def normal(self, state: Array, target: Array, weights: Array) -> NormalEquations:
@@ -112,8 +112,8 @@ class ModelChain:
         poses, twists = self.kinematics.joint_twists(state)
         twists = twists[:, self._moving]
         x = self._markers_at(poses)
-        off = target - x
-        pull = weights[:, :, None] * off
+        residual = target - x
+        pull = weights[:, :, None] * residual
         moments = np.concatenate(
             [
                 weights[:, :, None],
@@ -127,36 +127,38 @@ class ModelChain:
             axis=2,
         )
         return self._assembled(
-            state, twists, self._carries @ moments, np.einsum("fmi,fmi->f", pull, off)
+            state, twists, self._carries @ moments, np.einsum("fmi,fmi->f", pull, residual)
         )
 
-    def _assembled(
-        self, state: Array, twists: Array, carried: Array, cost: Array
-    ) -> NormalEquations:
+    def _assembled(self, state: Array, twists: Array, sums: Array, cost: Array) -> NormalEquations:
         """Return the normal equations of the free coordinates.
 
         Args:
             state: coordinates, rad and m, shape (f, n).
             twists: twists of the moving coordinates, shape (f, k, 6).
-            carried: sums over the markers that each coordinate moves, shape (f, k, 25).
+            sums: sums over the markers that each coordinate moves, shape (f, k, 25).
             cost: weighted sum of squared distances, m², shape (f,).
         """
         a, b = twists[..., :3], twists[..., 3:]
-        weight, first, pull = carried[..., :1], carried[..., 1:4], carried[..., 4:7]
-        second = carried[..., 7:16].reshape(*weight.shape[:2], 3, 3)
-        turning = carried[..., 16:25].reshape(*weight.shape[:2], 3, 3)
+        weight, first, pull = sums[..., :1], sums[..., 1:4], sums[..., 4:7]
+        second = sums[..., 7:16].reshape(*weight.shape[:2], 3, 3)
+        turning = sums[..., 16:25].reshape(*weight.shape[:2], 3, 3)
         force = weight * b + cross(a, first)
         moment = cross(first, b) + _trace(second) * a - _product(second, a)
         matrix = twists @ np.concatenate([moment, force], axis=-1).swapaxes(1, 2)
-        # Σ w u_j × r, of which (a × x) × r = x (a·r) - a (x·r)
+        # Σ w u_j × r, with (a × x) × r = x (a·r) - a (x·r)
         lever = cross(b, pull) + _product(turning, a) - _trace(turning) * a
-        bent = -a @ lever.swapaxes(1, 2)
+        curvature = -a @ lever.swapaxes(1, 2)
         torque = np.stack(
             [turning[..., i, j] - turning[..., j, i] for i, j in ((1, 2), (2, 0), (0, 1))], axis=-1
         )
         right = np.einsum("fni,fni->fn", a, torque) + np.einsum("fni,fni->fn", b, pull)
-        matrix, bent = (self._free_part(self._symmetric(part), state) for part in (matrix, bent))
-        return NormalEquations(cost, matrix, self._free_part(right[..., None], state)[..., 0], bent)
+        matrix, curvature = (
+            self._free_part(self._symmetric(part), state) for part in (matrix, curvature)
+        )
+        return NormalEquations(
+            cost, matrix, self._free_part(right[..., None], state)[..., 0], curvature
+        )
 
     def _symmetric(self, matrix: Array) -> Array:
         """Return the symmetric matrix (f, n, n). Only entries with i before j are read."""
@@ -209,9 +211,9 @@ def _tree(kinematics: Kinematics, at: Sequence[int]) -> tuple[Array, Array]:
     model, bodies = kinematics.model, kinematics.bodies
     hanging: dict[Joint, set[int]] = {}  # bodies outboard of each joint
     for joint in reversed(model.joints):  # from the ends inwards
-        own = {bodies[joint.outboard]}
-        own.update(*(h for j, h in hanging.items() if j.inboard == joint.outboard))
-        hanging[joint] = own
+        outboard = {bodies[joint.outboard]}
+        outboard.update(*(h for j, h in hanging.items() if j.inboard == joint.outboard))
+        hanging[joint] = outboard
     count = len(kinematics.coordinates)
     carries, above = np.zeros((count, len(at))), 0.5 * np.eye(count)
     order = []  # (coordinate, its joint), from ground outwards

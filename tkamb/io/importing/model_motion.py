@@ -38,7 +38,7 @@ class ModelMotion:
     Args:
         time: times, s, shape (n,).
         values: values of `COLUMNS`, mm and deg, shape (n, 12).
-        missing: coordinates of the model that the file lacks; they have their default values.
+        missing: coordinates of the model that the file lacks. They have their default values.
         remarks: lines for the report on how the file was read.
     """
 
@@ -59,7 +59,7 @@ class ModelMotion:
                 f"has no two frames between {start:g} and {end:g} s, the motion lasts from "
                 f"{self.time[0]:g} to {self.time[-1]:g} s",
                 "--interval",
-                "choose another",
+                "choose another interval",
             )
         return replace(self, time=self.time[inside], values=self.values[inside])
 
@@ -118,10 +118,10 @@ def model_feet(links: Links, recorded: Table) -> Feet:
     except InputError:
         bodies[OTHER[leg.side]] = ()  # a model of one leg
     middles = {
-        side: np.mean([poses[:, kinematics.bodies[body], :3, 3] for body in own], axis=0)
-        if own
+        side: np.mean([poses[:, kinematics.bodies[body], :3, 3] for body in names], axis=0)
+        if names
         else np.full((recorded.rows, 3), np.nan)
-        for side, own in bodies.items()
+        for side, names in bodies.items()
     }
     return Feet(recorded.path, recorded.time(), middles)
 

@@ -47,10 +47,10 @@ class ModelMassSettings:
     (Winter, Biomechanics, 2009)."""
     max_reasons: int = 3
     """The report of an import gives reasons for at most this number of unreadable parts. Chosen
-    because the report stays short."""
+    to keep the report short."""
     same_mass_share: float = 0.01
     """The model is not scaled if its mass differs from the subject's by less than this share.
-    Chosen because clothes and rounding change the mass by less."""
+    Chosen because such a difference may come from clothes and rounding."""
 
 
 MODEL_MASS = ModelMassSettings()
@@ -103,7 +103,7 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
         request.frames,
         bool(meshes and meshes.patella),
     )
-    scale, weighed = _mass_scale(request, leg)
+    scale, mass_line = _mass_scale(request, leg)
     tissue = soft_tissue(links)
     if meshes and meshes.femur_bone and not (tissue.quadriceps and tissue.patellar_ligament):
         hint = "leave it out, or complete the model"
@@ -134,7 +134,7 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
     report = [
         *_model_lines(model),
         *_leg_lines(leg),
-        weighed,
+        mass_line,
         *links.remarks,
         *_patella_line(links),
     ]
@@ -286,13 +286,14 @@ def marker_lines(case: Case) -> tuple[str, ...]:
             f"markers, {words}{used}: rms {np.nanmedian(rms):.1f} mm (at most {np.nanmax(rms):.1f})"
             f", flexion {np.nanmin(flexion):.1f} to {np.nanmax(flexion):.1f} deg"
         )
-    apart = result.at(result.centre_distance, case.motion.time) / MILLIMETRE
-    remark = (
+    distance = result.at(result.centre_distance, case.motion.time) / MILLIMETRE
+    difference = (
         result.at(result.flexion["segments"] - result.flexion["chain"], case.motion.time) / DEGREE
     )
     lines.append(
-        f"knee centres of shank and thigh markers: {np.nanmedian(apart):.1f} mm apart (at most "
-        f"{np.nanmax(apart):.1f}); flexions differ by at most {np.nanmax(np.abs(remark)):.1f} deg"
+        f"knee centres of shank and thigh markers: {np.nanmedian(distance):.1f} mm apart (at most "
+        f"{np.nanmax(distance):.1f}); flexions differ by at most "
+        f"{np.nanmax(np.abs(difference)):.1f} deg"
     )
     return tuple(lines)
 
@@ -304,13 +305,13 @@ def _mass_scale(request: ImportRequest, leg: Leg) -> tuple[float, str]:
         InputError: the model's leg has no mass, or the masses differ too much.
     """
     model, subject = leg.model.mass_kg, request.mass_kg
-    own = sum(leg.model.bodies[b].mass_kg for b in (*leg.femur, *leg.tibia, *leg.foot))
-    if own <= 0.0:
+    leg_mass = sum(leg.model.bodies[b].mass_kg for b in (*leg.femur, *leg.tibia, *leg.foot))
+    if leg_mass <= 0.0:
         raise InputError(
             "gives thigh, shank and foot no mass", request.model, "give its bodies their masses"
         )
-    if own > MODEL_MASS.one_leg_share * model:
-        return _leg_scale(request, own)
+    if leg_mass > MODEL_MASS.one_leg_share * model:
+        return _leg_scale(request, leg_mass)
     ratio = subject / model
     scaled = (
         abs(ratio - 1.0) > MODEL_MASS.same_mass_share
@@ -327,7 +328,7 @@ def _mass_scale(request: ImportRequest, leg: Leg) -> tuple[float, str]:
     return (ratio, text + f"scaled by {ratio:.4f}") if scaled else (1.0, text + "not scaled")
 
 
-def _leg_scale(request: ImportRequest, own: float) -> tuple[float, str]:
+def _leg_scale(request: ImportRequest, leg_mass: float) -> tuple[float, str]:
     """Return the factor on the masses of a model of one leg, and a remark on it.
 
     Such a model has the mass of a leg, or of the whole body if a scaling tool scaled it to the
@@ -335,30 +336,31 @@ def _leg_scale(request: ImportRequest, own: float) -> tuple[float, str]:
 
     Args:
         request: the import, with the subject's mass.
-        own: mass of thigh, shank and foot in the model, kg.
+        leg_mass: mass of thigh, shank and foot in the model, kg.
 
     Raises:
         InputError: the model has neither a leg's nor a whole body's mass.
     """
     subject = request.mass_kg
-    share, target = own / subject, MODEL_MASS.leg_mass_share * subject
+    share, target = leg_mass / subject, MODEL_MASS.leg_mass_share * subject
     low, high = LEG_SHARES
     whole_body = 0.5 < share < 2.0
     text = (
-        f"mass: the model is one leg of {own:.2f} kg, {share:.0%} of the subject's {subject:g} kg"
+        f"mass: the model is one leg of {leg_mass:.2f} kg, {share:.0%} of the subject's "
+        f"{subject:g} kg"
     )
     if low <= share <= high and not request.scale_mass:
         return 1.0, text + ": not scaled"
     if not (low <= share <= high or whole_body) or (whole_body and request.scale_mass is False):
         raise InputError(
-            f"is one leg of {own:.1f} kg, the subject weighs {subject:g} kg: a leg has "
+            f"is one leg of {leg_mass:.1f} kg, the subject weighs {subject:g} kg: a leg has "
             f"{low:.0%} to {high:.0%} of the body's mass",
             request.model,
             "check that --mass-kg is in kilograms; if it is, give the model's bodies a leg's "
             "masses",
         )
     why = ", the whole body's" if whole_body else ""
-    return target / own, (
+    return target / leg_mass, (
         f"{text}{why}: scaled to {target:.2f} kg, "
         f"the {MODEL_MASS.leg_mass_share:.1%} of a leg (Winter 2009)"
     )
@@ -367,10 +369,10 @@ def _leg_scale(request: ImportRequest, own: float) -> tuple[float, str]:
 def _model_lines(model: OpenSimModel) -> list[str]:
     """Return notes on reading the model, and lines on unreadable parts that the knee can lack."""
     lines = [f"model: {notice}" for notice in model.notices]
-    unread = [f"{one.kind} '{one.name}'" for one in model.unread]
+    unread = [f"{element.kind} '{element.name}'" for element in model.unread]
     if unread:
         lines.append(f"not read, and not needed for this knee: {some_names(unread)}")
-        lines += [f"  {one.reason}" for one in model.unread[: MODEL_MASS.max_reasons]]
+        lines += [f"  {element.reason}" for element in model.unread[: MODEL_MASS.max_reasons]]
     return lines
 
 
@@ -411,13 +413,13 @@ def _title(request: ImportRequest) -> tuple[str, ...]:
 def _notes(
     request: ImportRequest, scale: float, trial: Trial, own_ligaments: bool
 ) -> tuple[str, ...]:
-    alone = (
+    quadriceps_note = (
         "Without [muscles] only the quadriceps acts. When hamstrings and gastrocnemius act too, "
         "the contact force is too low, and the quadriceps force is the least that the joint moment "
         "needs."
     )
     notes = [
-        *(() if request.muscles else (alone,)),
+        *(() if request.muscles else (quadriceps_note,)),
         *_motion_notes(request, trial),
         "Foot and shank are one body with the ankle at its neutral angle.",
     ]
@@ -449,14 +451,13 @@ def _motion_notes(request: ImportRequest, trial: Trial) -> list[str]:
         notes.append(f"The poses are read with the other sign of {names}.")
     if request.poses.stride:
         notes.append(
-            "The knee's motion is from another recording than ground reaction and shank. Its "
-            "phase is "
-            "mapped to one of their strides: an assumption."
+            "The knee's motion is from another recording than ground reaction and shank. tkamb "
+            "assumes that it has the phase of one stride of that recording."
         )
     if centres := [name.replace("_", " ") for name in trial.shank.centres]:
         notes.append(
-            f"The shank shows {len(trial.shank.points)} markers. They are completed by "
-            f"{' and '.join(centres)} from the markers of its neighbours, so its lean is less "
-            f"certain."
+            f"The shank shows {len(trial.shank.points)} markers. Its pose also uses "
+            f"{' and '.join(centres)} from the markers of neighbouring segments, so that its lean "
+            "is less certain."
         )
     return notes

@@ -3,8 +3,8 @@
 The forces are from the plates of a C3D file, or from a table of ground reactions. Programs name the
 columns of such a table in many ways: `ground_force_1_vx`, `1_ground_force_px`,
 `ground_torque_1_y`, `ground_moment_1_mx`, `ground_force_calcn_r_mx`, `f1_1`, `FP2_tz`. A column
-name contains the kind (force, point, moment), the axis, and the name of a force. If a force lacks
-its moment, a moment column without a force is an error. The moment is then not assumed to be zero.
+name contains the kind (force, point, moment), the axis, and the name of a force. If a force has no
+moment, a moment column that belongs to no force is an error.
 """
 
 import re
@@ -75,37 +75,40 @@ def table_forces(table: Table) -> list[TableForce]:
     Raises:
         InputError: a moment column belongs to no force, or one axis has two columns.
     """
-    columns = [c for name in table.columns if (c := _taken_apart(name)) is not None]
+    columns = [c for name in table.columns if (c := _parsed_column(name)) is not None]
     result: dict[str, TableForce] = {}
     for column in columns:
         if column.kind == "force":
             result.setdefault(column.owner, TableForce(column.stem))
     forces = {k for k in result if sum(c.owner == k and c.kind == "force" for c in columns) >= 3}
-    strangers = [c for c in columns if c.kind == "moment" and c.owner not in forces]
-    alone = len(forces) == 1 and not any(c.kind == "moment" and c.owner in forces for c in columns)
-    if strangers and alone and len({c.owner for c in strangers}) == 1:
+    unassigned = [c for c in columns if c.kind == "moment" and c.owner not in forces]
+    is_single = len(forces) == 1 and not any(
+        c.kind == "moment" and c.owner in forces for c in columns
+    )
+    if unassigned and is_single and len({c.owner for c in unassigned}) == 1:
         owner = next(iter(forces))
         columns = [
-            _Column(c.name, c.kind, c.axis, owner, c.stem) if c in strangers else c for c in columns
+            _Column(c.name, c.kind, c.axis, owner, c.stem) if c in unassigned else c
+            for c in columns
         ]
-        strangers = []
+        unassigned = []
     for column in columns:
         if column.owner not in forces:
             continue
-        role, own = f"{column.kind}_{column.axis}", result[column.owner].columns
-        if role in own:
+        role, names = f"{column.kind}_{column.axis}", result[column.owner].columns
+        if role in names:
             raise InputError(
-                f"has two columns for one axis of one {column.kind}: '{own[role]}' and "
+                f"has two columns for one axis of one {column.kind}: '{names[role]}' and "
                 f"'{column.name}'",
                 table.path,
                 "rename or remove one",
             )
-        own[role] = column.name
-    _refuse_strangers(table, strangers, [result[k] for k in result if k in forces])
+        names[role] = column.name
+    _refuse_unassigned(table, unassigned, [result[k] for k in result if k in forces])
     return [result[k] for k in result if k in forces]
 
 
-def _refuse_strangers(table: Table, strangers: list[_Column], forces: list[TableForce]) -> None:
+def _refuse_unassigned(table: Table, unassigned: list[_Column], forces: list[TableForce]) -> None:
     """Raise an InputError if a moment column belongs to no force and a force has no moment."""
     read = {name for force in forces for name in force.columns.values()}
     others = [
@@ -113,7 +116,7 @@ def _refuse_strangers(table: Table, strangers: list[_Column], forces: list[Table
         for name in (*table.columns, *table.equal)
         if name not in read and (_OF_MOMENT.search(name.lower()) or _AXIS_LAST.search(name.lower()))
     ]
-    others += [column.name for column in strangers if column.name not in others]
+    others += [column.name for column in unassigned if column.name not in others]
     lacking = [force.name for force in forces if not force.moments]
     if others and lacking:
         raise InputError(
@@ -124,7 +127,7 @@ def _refuse_strangers(table: Table, strangers: list[_Column], forces: list[Table
         )
 
 
-def _taken_apart(name: str) -> _Column | None:
+def _parsed_column(name: str) -> _Column | None:
     """Return the parts of a column's name, or None if it is no force, point or moment."""
     plain = name.lower().rstrip()
     if match := _NUMBERED.fullmatch(plain):
@@ -145,8 +148,7 @@ def _taken_apart(name: str) -> _Column | None:
     if kind is None:
         return None
     owner = re.sub(r"[^a-z0-9]", "", _WORDS.sub("", stem))
-    own = name[: len(stem)].rstrip("_. ")
-    return _Column(name, kind, "xyz".index(axis) + 1, owner, own)
+    return _Column(name, kind, "xyz".index(axis) + 1, owner, name[: len(stem)].rstrip("_. "))
 
 
 def _kind(letter: str) -> str:
@@ -274,7 +276,7 @@ def marked_feet(recorded: Table, axes: str, labels: dict[str, list[str]]) -> Fee
         labels: side -> labels of the foot's markers.
     """
     rotation = laboratory_rotation(axes, recorded.path)
-    middles = {side: _middle(recorded, own) @ rotation.T for side, own in labels.items()}
+    middles = {side: _middle(recorded, names) @ rotation.T for side, names in labels.items()}
     return Feet(recorded.path, recorded.time(), middles)
 
 
@@ -288,8 +290,8 @@ def plate_forces(recording: Recording, axes: str) -> list[RecordedForce]:
     forces = []
     for plate in recording.plates:
         wrench = (plate.wrench.reshape(-1, 2, 3) @ rotation.T).reshape(-1, 6)
-        on = around_load(np.linalg.norm(wrench[:, :3], axis=1), time)
-        drift = unloaded_level(wrench[:, 1], on, time)
+        loaded = around_load(np.linalg.norm(wrench[:, :3], axis=1), time)
+        drift = unloaded_level(wrench[:, 1], loaded, time)
         level = float((rotation @ plate.centre)[1])
         title = f"force plate {plate.number}"
         forces.append(RecordedForce(plate.number, title, time, wrench, level, drift))
@@ -299,23 +301,23 @@ def plate_forces(recording: Recording, axes: str) -> list[RecordedForce]:
 def feet_loads(forces: list[RecordedForce], feet: Feet) -> list[Load]:
     """Return all loads of all forces in order of time, each with the nearest foot."""
     loads = []
-    for one in forces:
-        middles = {s: _interpolated(m, feet.time, one.time) for s, m in feet.middles.items()}
-        point = one.point
-        for first, last in uninterrupted_runs(one.loaded):
-            if one.time[last] - one.time[first] >= FOOT_CONTACT.min_duration:
+    for source in forces:
+        middles = {s: _interpolated(m, feet.time, source.time) for s, m in feet.middles.items()}
+        point = source.point
+        for first, last in uninterrupted_runs(source.loaded):
+            if source.time[last] - source.time[first] >= FOOT_CONTACT.min_duration:
                 part = slice(first, last + 1)
-                own = {side: middle[part] for side, middle in middles.items()}
-                line = (one.time[part], point[part], one.wrench[part, :3])
-                loads.append(_load(one, *line, own))
+                positions = {side: middle[part] for side, middle in middles.items()}
+                line = (source.time[part], point[part], source.wrench[part, :3])
+                loads.append(_load(source, *line, positions))
     return sorted(loads, key=lambda load: load.start)
 
 
 def _load(
-    one: RecordedForce, time: Array, point: Array, force: Array, middles: dict[str, Array]
+    source: RecordedForce, time: Array, point: Array, force: Array, middles: dict[str, Array]
 ) -> Load:
     """Return a load. For a foot on a step, its point is where the force's line meets the step."""
-    away, surface = {}, {}
+    distances, surface = {}, {}
     for side, middle in middles.items():
         above = middle[:, 1] - point[:, 1]
         height = float(np.nanmedian(above)) if np.isfinite(above).any() else 0.0
@@ -324,12 +326,13 @@ def _load(
         )
         place = point + force / force[:, 1:2] * surface[side]
         distance = np.linalg.norm((place - middle)[:, [0, 2]], axis=1)
-        away[side] = float(np.nanmedian(distance)) if np.isfinite(distance).any() else np.nan
-    nearest = min(away, key=lambda side: np.nan_to_num(away[side], nan=np.inf))
-    others = [distance for side, distance in away.items() if side != nearest]
-    foot = nearest if away[nearest] < FOOT_CONTACT.max_foot_distance else ""
+        distances[side] = float(np.nanmedian(distance)) if np.isfinite(distance).any() else np.nan
+    nearest = min(distances, key=lambda side: np.nan_to_num(distances[side], nan=np.inf))
+    others = [distance for side, distance in distances.items() if side != nearest]
+    foot = nearest if distances[nearest] < FOOT_CONTACT.max_foot_distance else ""
     start, end = float(time[0]), float(time[-1])
-    return Load(one.key, one.title, foot, start, end, away[nearest], others[0], surface[nearest])
+    distance, other = distances[nearest], others[0]
+    return Load(source.key, source.title, foot, start, end, distance, other, surface[nearest])
 
 
 def own_plates(
@@ -346,26 +349,26 @@ def own_plates(
     Raises:
         InputError: no plate was under the foot, or both feet stood on one plate.
     """
-    own = list(dict.fromkeys(load.plate for load in loads if load.side == side))
+    foot_plates = list(dict.fromkeys(load.plate for load in loads if load.side == side))
     others = {load.plate for load in loads if load.side != side}
-    shared = [load.title for load in loads if load.plate in own and load.plate in others]
+    shared = [load.title for load in loads if load.plate in foot_plates and load.plate in others]
     if shared:
         what = f"both feet stood on {shared[0]}"
-        if any(load.plate in own and not load.side for load in loads):
+        if any(load.plate in foot_plates and not load.side for load in loads):
             what = f"{shared[0]} is also loaded by a foot without markers"
         raise InputError(what, path, f"{hint}, or take another trial")
-    if not own:
-        unassigned = [load for load in loads if not load.side]
+    if not foot_plates:
+        unknown_loads = [load for load in loads if not load.side]
         what = f"no force plate was under the {side} foot"
-        if unassigned:
+        if unknown_loads:
             what += (
-                f": {unassigned[0].title} is loaded from {unassigned[0].start:.2f} to "
-                f"{unassigned[0].end:.2f} s, but no foot's markers are within "
+                f": {unknown_loads[0].title} is loaded from {unknown_loads[0].start:.2f} to "
+                f"{unknown_loads[0].end:.2f} s, but no foot's markers are within "
                 f"{FOOT_CONTACT.max_foot_distance:g} m of its centre of pressure"
             )
             hint = f"check --laboratory-axes and the foot's labels, or {hint}"
         raise InputError(what, path, f"{hint}, or take another trial")
-    return tuple(sorted(own, key=str))
+    return tuple(sorted(foot_plates, key=str))
 
 
 def common_surface(loads: list[Load], plates: tuple[int | str, ...]) -> float:
@@ -382,8 +385,9 @@ def known_interval(
     Raises:
         InputError: fewer than two frames lie between the first and the last load.
     """
-    own = [load for load in loads if load.plate in plates]
-    start, end = min(load.start for load in own), max(load.end for load in own)
+    foot_loads = [load for load in loads if load.plate in plates]
+    start = min(load.start for load in foot_loads)
+    end = max(load.end for load in foot_loads)
     inside = feet.time[(feet.time >= start - 1e-9) & (feet.time <= end + 1e-9)]
     if len(inside) < 2:
         raise InputError(
@@ -404,12 +408,12 @@ def unmeasured(
     """Return the times, s, within an interval at which the foot is nearly still but on no plate."""
     time = feet.time
     speed = np.linalg.norm(np.gradient(feet.middles[side], time, axis=0), axis=1)
-    on = np.zeros(len(time), bool)
+    loaded = np.zeros(len(time), bool)
     for load in loads:
         if load.plate in plates:
-            on |= (time >= load.start - 0.02) & (time <= load.end + 0.02)
+            loaded |= (time >= load.start - 0.02) & (time <= load.end + 0.02)
     inside = (time >= interval[0]) & (time <= interval[1])
-    return np.asarray(time[inside & ~on & (speed < FOOT_CONTACT.max_standing_speed)])
+    return np.asarray(time[inside & ~loaded & (speed < FOOT_CONTACT.max_standing_speed)])
 
 
 def _middle(table: Table, labels: list[str]) -> Array:

@@ -81,7 +81,7 @@ def shank_markers(
     centres: dict[str, list[str]] = {}
     text: list[str] = []
     if len(points) < 3:
-        centres, text = _carried(links, segments, femur)
+        centres, text = _joint_centres(links, segments, femur)
     if len(points) + len(centres) < 3:
         raise InputError(
             f"shows {len(points)} markers of the shank and joint centres for {len(centres)} more; "
@@ -92,7 +92,7 @@ def shank_markers(
     return ShankMarkers(recording, axes, points, centres, tuple(text))
 
 
-def _carried(
+def _joint_centres(
     links: Links, segments: Mapping[str, ModelSegment], femur: Array
 ) -> tuple[dict[str, list[str]], list[str]]:
     """Return the joint centres from the markers of foot and thigh, and remarks on them."""
@@ -105,15 +105,15 @@ def _carried(
         )
         text.append(f"shank: the foot's {len(foot.points)} markers give its ankle centre")
     if len(thigh.points) >= 3:
-        own = {name: transform(links.femur, point) for name, point in thigh.points.items()}
+        markers = {name: transform(links.femur, point) for name, point in thigh.points.items()}
         centre = transform(inverse(leg.neutral[leg.femur[0]]), leg.knee_centre)
         places = transform(femur, centre)
         mean = places.mean(axis=0)
-        apart = np.sqrt(((places - mean) ** 2).sum(axis=1).mean()) / MILLIMETRE
-        centres["knee_centre"] = _centre_lines("knee_centre", own, centre, mean)
+        spread = np.sqrt(((places - mean) ** 2).sum(axis=1).mean()) / MILLIMETRE
+        centres["knee_centre"] = _centre_lines("knee_centre", markers, centre, mean)
         text.append(
-            f"shank: the thigh's {len(own)} markers give its knee centre, at the mean of "
-            f"{len(places)} recorded poses ({apart:.1f} mm rms about it)"
+            f"shank: the thigh's {len(markers)} markers give its knee centre, at the mean of "
+            f"{len(places)} recorded poses ({spread:.1f} mm rms about it)"
         )
     return centres, text
 
@@ -210,7 +210,7 @@ class RecordedPoses:
         lines = ["[motion]", f"file = {path}", f"cutoff_Hz = {cutoff_Hz:g}"]
         for key, value in self.given.keys().items():
             if key == "cycle_s":
-                lines.append("# times of the recording at 0 and 100 %: given, an assumption")
+                lines.append("# s, assumed times of the recording at 0 and 100 %")
             lines.append(f"{key} = {_toml(value)}")
         if self.interval:
             lines.append(f"interval_s = {_toml(list(self.interval))}")
@@ -248,8 +248,9 @@ def read_poses(
     side: Literal["right", "left"] = "left" if links.leg.side == "left" else "right"
     motion = load_motion(_motion_table(recording, cutoff_Hz, interval), side, placement, turn)
     knee = knee_pose(motion.raw_coordinates)
-    own_side = mirrored_pose(knee) if side == "left" else knee  # coordinates are of a right knee
-    femur = links.insert_in_tibia @ own_side @ inverse(links.femur)
+    # The coordinates are of a right knee.
+    femur_in_insert = mirrored_pose(knee) if side == "left" else knee
+    femur = links.insert_in_tibia @ femur_in_insert @ inverse(links.femur)
     stance = _in_stance(recording, motion)
     return RecordedPoses(
         recording, interval, motion.time, femur, stance, _remarks(recording, motion)
@@ -278,7 +279,7 @@ def _in_stance(recording: PoseRecording, motion: KneeMotion) -> Array:
         raise InputError(
             f"holds no pose: the file's time runs from {clock[0]:g} to {clock[-1]:g}",
             "--stance",
-            "give the part in which the foot is loaded, in the unit of that column",
+            "give the part in which the foot is loaded, in the unit of the file's time",
         )
     return np.asarray(inside)
 
@@ -297,8 +298,8 @@ def _remarks(recording: PoseRecording, motion: KneeMotion) -> tuple[str, ...]:
     if recording.stride:
         closed = "a closed cycle" if motion.closed_cycle else "not closed"
         text.append(
-            f"phase: its 0 and 100 % are laid on {recording.stride[0]:g} and "
-            f"{recording.stride[1]:g} s of the recording, as given: an assumption ({closed})"
+            f"phase: 0 and 100 % of the poses are assumed at {recording.stride[0]:g} and "
+            f"{recording.stride[1]:g} s of the recording, as given ({closed})"
         )
     return tuple(text)
 

@@ -290,7 +290,7 @@ class SceneText:
         link = toml_text(body_link(self.links.leg.femur[0]))
         mesh = f'mesh = {self._path(m.femur_bone)}, unit = "{m.unit}"'
         return [
-            "# bone that the line may wrap, beside the component",
+            "# bone that the line may wrap, as well as the component",
             f"bone = {{ {mesh}, link = {link} }}",
         ]
 

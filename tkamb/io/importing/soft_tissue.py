@@ -14,8 +14,8 @@ class ImportedLigamentSettings:
     """Properties of imported ligaments that an OpenSim model does not state."""
 
     toe_strain: float = 0.06
-    """Strain at the end of the toe region of the law \"quadratic-toe\". It is twice the 0.03
-    of Blankevoort (1991)."""
+    """Strain at the end of the toe region of the law "quadratic-toe": twice the 0.03 of
+    Blankevoort (1991)."""
 
 
 IMPORTED_LIGAMENT = ImportedLigamentSettings()
@@ -74,7 +74,7 @@ def _end(point: PathPoint) -> End:
 
 
 def _fixed(path: Path, bodies: tuple[str, ...]) -> list[PathPoint]:
-    """Return the points of a path that are always active and fixed to one of some bodies."""
+    """Return the points of a path that are always active and fixed to one of the bodies."""
     return [p for p in path.points if type(p) is PathPoint and p.body in bodies]
 
 
@@ -93,7 +93,7 @@ def _quadriceps(links: Links, remarks: list[str]) -> tuple[End, End] | None:
             )
             return _end(femur[-1]), _end(patella[0])
     remarks.append("no vastus intermedius from femur to patella: no quadriceps")
-    remarks += [one.reason for one in leg.model.unread if "vasint" in one.name.lower()]
+    remarks += [part.reason for part in leg.model.unread if "vasint" in part.name.lower()]
     return None
 
 
@@ -137,14 +137,14 @@ def _patellar_ligament(links: Links, remarks: list[str]) -> tuple[tuple[End, End
 def _bundles(links: Links, remarks: list[str]) -> tuple[Bundle, ...]:
     leg = links.leg
     bundles: list[Bundle] = []
-    out: dict[str, list[str]] = {}
+    omitted: dict[str, list[str]] = {}
     for ligament in leg.model.ligaments.values():
         femur, tibia = _fixed(ligament.path, leg.femur), _fixed(ligament.path, leg.tibia)
         if not (femur and tibia):
             continue
-        reason = _reason_against(ligament, len(femur) + len(tibia))
+        reason = _omission_reason(ligament, len(femur) + len(tibia))
         if reason or ligament.stiffness_N is None:
-            out.setdefault(reason, []).append(ligament.name)
+            omitted.setdefault(reason, []).append(ligament.name)
             continue
         bundles.append(
             Bundle(
@@ -160,12 +160,12 @@ def _bundles(links: Links, remarks: list[str]) -> tuple[Bundle, ...]:
             f"{len(bundles)} femorotibial ligament strands imported as straight lines "
             "(wraps on bone are left out)"
         )
-    for reason, names in out.items():
+    for reason, names in omitted.items():
         remarks.append(f"ligaments left out, {reason}: {some_names(names)}")
     return tuple(bundles)
 
 
-def _reason_against(ligament: OpenSimLigament, fixed: int) -> str:
+def _omission_reason(ligament: OpenSimLigament, fixed: int) -> str:
     if not ligament.enabled:
         return "switched off in the model"
     if fixed != 2 or len(ligament.path.points) != 2:

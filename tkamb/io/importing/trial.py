@@ -51,16 +51,16 @@ def with_static_markers(
         length_unit: unit of lengths in the trial; None: the unit that the file states.
     """
     assert scene.markers is not None
-    stated = Scene.model_validate(tomllib.loads(scene.text())).motion.markers
-    assert stated is not None
+    marker_table = Scene.model_validate(tomllib.loads(scene.text())).motion.markers
+    assert marker_table is not None
     recorded = with_unit(read_table(static), length_unit)
-    own = facing(segments_of(recorded, segments), recorded).axes
-    stated = stated.model_copy(update={"laboratory_axes": own})
+    axes = facing(segments_of(recorded, segments), recorded).axes
+    marker_table = marker_table.model_copy(update={"laboratory_axes": axes})
     side: Literal["right", "left"] = "left" if scene.side == "left" else "right"
     insert = scene.links.insert_in_tibia
     if side == "left":
         insert = mirrored_pose(insert)
-    places = calibrated_markers(stated, recorded, side, insert)
+    places = calibrated_markers(marker_table, recorded, side, insert)
     changed_segments, farthest = [], 0.0
     for segment in segments:
         by_label = {plain_label(k): v for k, v in places[segment.name].items()}
@@ -70,7 +70,7 @@ def with_static_markers(
         changed_segments.append(replace(segment, points=points))
     markers = replace(scene.markers, segments=tuple(changed_segments))
     line = (
-        f"markers' places are those of the standing trial {static.name}, at most "
+        f"marker positions are from the standing trial {static.name}, at most "
         f"{farthest * 1e3:.1f} mm from the model's"
     )
     notices = [f"notice: {static.name}: {notice}" for notice in recorded.notices]
@@ -100,25 +100,25 @@ def calibrated_markers(
     """
     labels = [column[:-2] for column in recorded.columns if column.endswith("_x")]
     points = [
-        own.model_copy(
+        segment.model_copy(
             update={
                 "markers_mm": {
-                    k: v for k, v in own.markers_mm.items() if matched_labels([k], labels)
+                    k: v for k, v in segment.markers_mm.items() if matched_labels([k], labels)
                 }
             }
         )
-        for own in table.segment
+        for segment in table.segment
     ]
     markers = table.model_copy(update={"segment": tuple(points)})
     segments, measured = leg_segments(markers, recorded, None, side)
     chain = LegChain(segments, pose_insert_in_tibia, markers.knee == "free")
     neutral = neutral_coordinates(markers, side)
-    _, whole = both_fits(chain, segments, measured, neutral, recorded)
+    _, chain_fit = both_fits(chain, segments, measured, neutral, recorded)
     mirror = MIRROR if side == "left" else np.eye(3)
     result = {}
-    for name, poses in chain.poses(whole.state).items():
-        own_axes = np.nanmean(transform(inverse(poses), measured[name]), axis=0) @ mirror
-        result[name] = dict(zip(chain.segments[name].labels, own_axes, strict=True))
+    for name, poses in chain.poses(chain_fit.state).items():
+        positions = np.nanmean(transform(inverse(poses), measured[name]), axis=0) @ mirror
+        result[name] = dict(zip(chain.segments[name].labels, positions, strict=True))
     return result
 
 
@@ -163,8 +163,8 @@ def from_markers(request: ImportRequest, leg: Leg, links: Links, recorded: Table
     """
     segments = model_segments(links, recorded, request.without)
     facing = _facing(request, segments, recorded)
-    feet_there = marked_feet(recorded, facing.axes, feet(leg, recorded, OTHER[leg.side]))
-    result = find_ground(request, leg.side, facing.axes, feet_there)
+    foot_positions = marked_feet(recorded, facing.axes, feet(leg, recorded, OTHER[leg.side]))
+    result = find_ground(request, leg.side, facing.axes, foot_positions)
     time = recorded.time()
     if request.interval is not None:
         _check_within(time, *request.interval)
@@ -199,8 +199,8 @@ def from_poses(
     stance = poses.femur[poses.in_stance]
     shank = shank_markers(links, segments, stance, request.recording, facing.axes)
     covered = replace(request, interval=(float(poses.time[0]), float(poses.time[-1])))
-    feet_there = marked_feet(recorded, facing.axes, feet(leg, recorded, OTHER[leg.side]))
-    result = find_ground(covered, leg.side, facing.axes, feet_there)
+    foot_positions = marked_feet(recorded, facing.axes, feet(leg, recorded, OTHER[leg.side]))
+    result = find_ground(covered, leg.side, facing.axes, foot_positions)
     matched = [*_notices(request, recorded), *_segment_lines(segments.values(), request.without)]
     text = (
         *poses.remarks,
@@ -267,8 +267,8 @@ def _segment_lines(segments: Iterable[ModelSegment], without: tuple[str, ...]) -
     lines = []
     for segment in segments:
         missing = f"; not recorded: {', '.join(segment.missing)}" if segment.missing else ""
-        own = ", ".join(segment.points) or "none"
-        lines.append(f"markers of the {segment.name}: {own}{missing}")
+        names = ", ".join(segment.points) or "none"
+        lines.append(f"markers of the {segment.name}: {names}{missing}")
     return lines + ([f"markers left out, as given: {', '.join(without)}"] if without else [])
 
 
@@ -284,16 +284,18 @@ def _thinned(
     inside = time[(time >= start - 1e-9) & (time <= end + 1e-9)]
     if len(inside) < 2:
         raise InputError(
-            f"has no two frames between {start:g} and {end:g} s", "--interval", "choose another"
+            f"has no two frames between {start:g} and {end:g} s",
+            "--interval",
+            "choose another interval",
         )
     rate = 1.0 / float(np.median(np.diff(inside)))
-    every = max(int(rate / (TRIAL_FRAMES.frames_per_period * cutoff_Hz) + 1e-9), 1)
-    count = (len(inside) - 1) // every + 1
+    stride = max(int(rate / (TRIAL_FRAMES.frames_per_period * cutoff_Hz) + 1e-9), 1)
+    count = (len(inside) - 1) // stride + 1
     even = np.ptp(np.diff(inside)) < 1e-6
-    if every == 1 or not even or count < 8:
+    if stride == 1 or not even or count < 8:
         return (float(inside[0]), float(inside[-1])), None, f"frames: all {len(inside)}"
-    last = float(inside[(count - 1) * every])
-    line = f"frames: every {every}th of the recording, {count} at {rate / every:g} Hz"
+    last = float(inside[(count - 1) * stride])
+    line = f"frames: one in {stride} of the recording, {count} at {rate / stride:g} Hz"
     return (float(inside[0]), last), count, line
 
 

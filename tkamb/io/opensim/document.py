@@ -50,7 +50,7 @@ class Document:
 
     @contextmanager
     def reading(self, element: Element) -> Iterator[None]:
-        """Run a block that reads an element. A partial reading adds its error to `unread`."""
+        """Run a block that reads an element. If `partial`, a block's error is added to `unread`."""
         try:
             yield
         except InputError as error:
@@ -265,45 +265,47 @@ def _read(path: Path, notices: list[str]) -> Element:
     try:
         return parse_xml(content, path, what=WHAT)
     except InputError as error:
-        text, mended = _lenient(content)
-        if not mended:
+        text, repairs = _lenient(content)
+        if not repairs:
             raise
         try:
             root = parse_xml(text.encode("utf-8"), path, what=WHAT)
         except InputError:
             raise error from None  # this error has the line number of the unchanged file
-    notices.append(f"{path.name} is not strict XML ({', '.join(mended)}), read as OpenSim reads it")
+    notices.append(
+        f"{path.name} is not strict XML ({', '.join(repairs)}), read as OpenSim reads it"
+    )
     return root
 
 
 def _lenient(content: bytes) -> tuple[str, list[str]]:
     """Return the text as strict XML without a declaration, and words on each repair."""
-    mended = []
+    repairs = []
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
-        mended.append(f"line {line} is not UTF-8, taken as Latin-1")
+        repairs.append(f"line {line} is not UTF-8, taken as Latin-1")
         text = content.decode("cp1252", errors="replace")
     text, count = _DECLARATION.subn("", text)
     if not count and content.lstrip()[:5] == b"<?xml":
-        mended.append("its XML declaration")
+        repairs.append("its XML declaration")
     if content[:1].isspace():
-        mended.append("blanks before its first line")
+        repairs.append("blanks before its first line")
     if "<!DOCTYPE" not in text and (result := _BARE_AMPERSAND.search(text)):
-        mended.append(f"a bare & in line {text.count(chr(10), 0, result.start()) + 1}")
+        repairs.append(f"a bare & in line {text.count(chr(10), 0, result.start()) + 1}")
         text = _BARE_AMPERSAND.sub("&amp;", text)
     plain = _COMMENT.sub(lambda m: f"<!--{re.sub('-+', '-', m[1]).strip('-')}-->", text)
     if "--" in "".join(_COMMENT.findall(text)):
-        mended.append("-- within a comment")
+        repairs.append("-- within a comment")
         text = plain
     if _CONTROL.search(text):
-        mended.append("control characters")
+        repairs.append("control characters")
         text = _CONTROL.sub("", text)
     if (end := _END.search(text)) and text[end.end() :].strip():
-        mended.append("text after its last element")
+        repairs.append("text after its last element")
         text = text[: end.end()]
-    return text, mended
+    return text, repairs
 
 
 def _include(element: Element, path: Path, opened: tuple[Path, ...], notices: list[str]) -> None:
@@ -319,23 +321,23 @@ def _replace(
 ) -> tuple[Path, tuple[Path, ...]]:
     """Fill an element from the file that it includes. Return this file and all opened files."""
     where = f"{path}: {element.tag} file='{name}'"
-    other = path.parent / name.replace("\\", "/")
-    if not other.is_file() and element.tag in NOT_NEEDED:
+    included = path.parent / name.replace("\\", "/")
+    if not included.is_file() and element.tag in NOT_NEEDED:
         notices.append(f"{element.tag} is left out: its file {name} does not exist")
         return path, opened
-    if other.resolve() in opened or len(opened) > DOCUMENT.max_nested_files:
-        raise InputError("names a file that names it in turn, or nests files too deep", where)
-    if not other.exists():
+    if included.resolve() in opened or len(opened) > DOCUMENT.max_nested_files:
+        raise InputError("names a file that includes this one, or nests files too deep", where)
+    if not included.exists():
         raise InputError(
-            f"names a file that does not exist ({other})", where, "put it beside the model"
+            f"names a file that does not exist ({included})", where, "put it beside the model"
         )
-    root = _read(other, notices)
+    root = _read(included, notices)
     target = root
     if root.tag == "OpenSimDocument":
-        of_tag = [child for child in root if child.tag == element.tag]
-        if not of_tag:
-            raise InputError(f"names a file without a <{element.tag}> ({other})", where)
-        target = of_tag[0]
+        matches = [child for child in root if child.tag == element.tag]
+        if not matches:
+            raise InputError(f"names a file without a <{element.tag}> ({included})", where)
+        target = matches[0]
     if target.tag != element.tag:
         raise InputError(f"names a file with a <{target.tag}> instead of a <{element.tag}>", where)
     for source in (target, root):
@@ -345,7 +347,7 @@ def _replace(
     for key, value in target.attrib.items():
         element.attrib.setdefault(key, value)
     notices.append(f"{element.tag} read from {name}")
-    return other, (*opened, other.resolve())
+    return included, (*opened, included.resolve())
 
 
 def _apply_defaults(target: Element, defaults: Element | None) -> None:

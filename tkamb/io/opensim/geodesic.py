@@ -284,18 +284,18 @@ def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) 
     converged = np.zeros(len(p), bool)
     limit = 0.3 * axes.max()
     entry, leave = np.empty_like(start), np.empty_like(start)
-    waiting = np.arange(len(p))
+    active = np.arange(len(p))
     for _ in range(GEODESIC.max_iterations):
-        turned = angle[waiting]
+        angles = angle[active]
         shot = _Shot(
-            start[waiting], end[waiting], axes, hub[waiting], radial[waiting], sideways[waiting]
+            start[active], end[active], axes, hub[active], radial[active], sideways[active]
         )
-        residual, jacobian, entry[waiting], leave[waiting], ahead = shot.fire(
-            turned, arc[waiting, None] * shares[waiting]
+        residual, jacobian, entry[active], leave[active], ahead = shot.fire(
+            angles, arc[active, None] * shares[active]
         )
         small = np.abs(residual).max(axis=1)
         is_converged = (small < GEODESIC.tolerance) & (ahead > 0.0)
-        converged[waiting[is_converged]] = True
+        converged[active[is_converged]] = True
         if is_converged.all():
             break
         step = -np.linalg.solve(jacobian[~is_converged], residual[~is_converged][..., None])[..., 0]
@@ -303,12 +303,12 @@ def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) 
         # about as long as the straight part that leads back.
         past = ((small < GEODESIC.overshoot_below) & (ahead <= 0.0))[~is_converged]
         step[past] = np.column_stack([np.zeros(past.sum()), 2.0 * ahead[~is_converged][past]])
-        waiting = waiting[~is_converged]
+        active = active[~is_converged]
         # Long steps are shortened, because derivatives far from the solution are unreliable.
         share = np.minimum(1.0, 0.4 / np.maximum(np.abs(step[:, 0]), 1e-300))
         share = np.minimum(share, limit / np.maximum(np.abs(step[:, 1]), 1e-300))
-        angle[waiting] += share * step[:, 0]
-        arc[waiting] = np.maximum(arc[waiting] + share * step[:, 1], -limit)
+        angle[active] += share * step[:, 0]
+        arc[active] = np.maximum(arc[active] + share * step[:, 1], -limit)
     converged &= arc > -GEODESIC.tolerance
     straight = np.linalg.norm(entry - start, axis=1) + np.linalg.norm(end - leave, axis=1)
     return Strings(entry, leave, arc, straight + arc, converged)
@@ -339,37 +339,37 @@ class _Shot:
         """
         cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
         entry = self.axes * (self.hub + cosine * self.radial + sine * self.sideways)
-        moved = self.axes * (cosine * self.sideways - sine * self.radial)
+        tangent = self.axes * (cosine * self.sideways - sine * self.radial)
         distance = np.linalg.norm(entry - self.start, axis=1, keepdims=True)
         ahead = (entry - self.start) / distance
-        across = (np.cross(_normal(entry, self.axes)[0], ahead) * moved).sum(axis=1)
+        across = (np.cross(_normal(entry, self.axes)[0], ahead) * tangent).sum(axis=1)
         state = np.column_stack([entry, ahead, across, across / distance[:, 0]])
         _follow_geodesics(state, pieces, self.axes, DOP853.A, DOP853.B)
         leave, direction = state[:, :3], state[:, 3:6]
         field, rate = state[:, 6], state[:, 7]
         normal, slope = _normal(leave, self.axes)
         binormal = np.cross(normal, direction)
-        rest = self.end - leave
-        reach = np.linalg.norm(rest, axis=1, keepdims=True)
-        rest = rest / reach
-        shift = (moved * ahead).sum(axis=1)[:, None] * direction + field[:, None] * binormal
+        outgoing = self.end - leave
+        reach = np.linalg.norm(outgoing, axis=1, keepdims=True)
+        outgoing = outgoing / reach
+        shift = (tangent * ahead).sum(axis=1)[:, None] * direction + field[:, None] * binormal
         by_arc, by_angle = (self._turn(v, normal, slope) for v in (direction, shift))
-        residual = np.stack([dot(rest, normal), dot(rest, binormal)], axis=1)
+        residual = np.stack([dot(outgoing, normal), dot(outgoing, binormal)], axis=1)
         jacobian = np.empty((len(angle), 2, 2))
-        jacobian[:, 0, 0] = dot(rest, by_angle)
-        jacobian[:, 0, 1] = dot(rest, by_arc)
+        jacobian[:, 0, 0] = dot(outgoing, by_angle)
+        jacobian[:, 0, 1] = dot(outgoing, by_arc)
         jacobian[:, 1, 0] = (
-            dot(rest, np.cross(by_angle, direction))
+            dot(outgoing, np.cross(by_angle, direction))
             - field / reach[:, 0]
-            - rate * dot(rest, direction)
+            - rate * dot(outgoing, direction)
         )
-        jacobian[:, 1, 1] = dot(rest, np.cross(by_arc, direction))
-        return residual, jacobian, entry, leave, reach[:, 0] * dot(rest, direction)
+        jacobian[:, 1, 1] = dot(outgoing, np.cross(by_arc, direction))
+        return residual, jacobian, entry, leave, reach[:, 0] * dot(outgoing, direction)
 
     def _turn(self, velocity: Array, normal: Array, slope: Array) -> Array:
         """Return the rates (f, 3) of the unit normals at points with velocities (f, 3)."""
-        bent = velocity / self.axes**2
-        return (bent - dot(bent, normal)[:, None] * normal) / slope[:, None]
+        gradient_rate = velocity / self.axes**2
+        return (gradient_rate - dot(gradient_rate, normal)[:, None] * normal) / slope[:, None]
 
 
 def _normal(points: Array, axes: Array) -> tuple[Array, Array]:

@@ -130,8 +130,8 @@ class Kinematics:
         values = np.asarray(q, float)
         if values.shape[-1:] != (len(self.coordinates),):
             count = values.shape[-1] if values.ndim else 1
-            problem = f"{len(self.coordinates)} coordinates, {count} are given"
-            raise InputError(f"has {problem}", self.model.name)
+            what = f"has {len(self.coordinates)} coordinates, {count} are given"
+            raise InputError(what, self.model.name)
         return values
 
     def coupled(self, q: Mapping[str, float] | ArrayLike) -> Array:
@@ -222,17 +222,17 @@ class Kinematics:
         The poses within all joints are computed at once. The poses of the bodies are computed one
         by one from ground outwards.
         """
-        moved, before = self._joint_poses(values)
-        steps = np.where(self._backwards, inverse(moved), moved)
+        joint_poses, directions = self._joint_poses(values)
+        steps = np.where(self._backwards, inverse(joint_poses), joint_poses)
         steps = self._inboard_frames @ steps @ self._outboard_frames
         poses = np.zeros((*values.shape[:-1], len(self.bodies), 4, 4))
         poses[..., 0, :, :] = np.eye(4)
         for k, (inboard, outboard) in enumerate(self._ends):
             poses[..., outboard, :, :] = poses[..., inboard, :, :] @ steps[..., k, :, :]
         inner = [inboard for inboard, _ in self._ends]
-        to_frame = poses[..., inner, :, :] @ self._axis_frames(moved)
-        centre = (to_frame @ moved)[..., :3, 3]
-        spins = (to_frame[..., self._owner, :3, :3] @ before[..., None])[..., 0]
+        to_frame = poses[..., inner, :, :] @ self._axis_frames(joint_poses)
+        centre = (to_frame @ joint_poses)[..., :3, 3]
+        spins = (to_frame[..., self._owner, :3, :3] @ directions[..., None])[..., 0]
         twists = np.zeros((*values.shape, 6))
         turning, centres = self._turning, centre[..., self._owner[self._turning], :]
         twists[..., turning, :3] = spins[..., turning, :]
@@ -240,13 +240,15 @@ class Kinematics:
         twists[..., ~turning, 3:] = spins[..., ~turning, :]
         return poses, twists
 
-    def _axis_frames(self, moved: Array) -> Array:
+    def _axis_frames(self, joint_poses: Array) -> Array:
         """Return the poses (..., j, 4, 4) of the joints' parent frames in the inboard bodies.
 
         In a backwards joint, the parent frame belongs to the outboard body.
         """
         return np.asarray(
-            np.where(self._backwards, self._inboard_frames @ inverse(moved), self._inboard_frames)
+            np.where(
+                self._backwards, self._inboard_frames @ inverse(joint_poses), self._inboard_frames
+            )
         )
 
     def _joint_poses(self, values: Array) -> tuple[Array, Array]:
@@ -260,16 +262,15 @@ class Kinematics:
         turns = np.eye(3) + sine * self._crosses + versine * self._squares
         shape = values.shape[:-1]
         rotation = np.broadcast_to(np.eye(3), (*shape, len(self._ends), 3, 3)).copy()
-        before = np.broadcast_to(self._directions, (*shape, *self._directions.shape)).copy()
-        for (
-            axes
-        ) in self._ranks:  # the first rotations of all joints, then the second, then the third
+        directions = np.broadcast_to(self._directions, (*shape, *self._directions.shape)).copy()
+        # First the first rotations of all joints, then the second, then the third.
+        for axes in self._ranks:
             owners = self._owner[axes]
             previous = rotation[..., owners, :, :]
-            before[..., axes, :] = (previous @ self._directions[axes][..., None])[..., 0]
+            directions[..., axes, :] = (previous @ self._directions[axes][..., None])[..., 0]
             rotation[..., owners, :, :] = previous @ turns[..., axes, :, :]
         shift = np.where(self._turning, 0.0, values)[..., None] * self._directions
-        return pose(rotation, self._sums @ shift), before
+        return pose(rotation, self._sums @ shift), directions
 
 
 def cross(a: Array, b: Array) -> Array:

@@ -221,7 +221,7 @@ def _angle_scale(angles: dict[str, Array], recorded: Table) -> float:
             f"says inDegrees=no, but '{worst}' reaches {largest:.4g}, which no joint does in "
             "radians",
             recorded.path,
-            "write inDegrees=yes where it is in degrees",
+            "write inDegrees=yes if the angles are in degrees",
         )
     return DEGREE if recorded.in_degrees else 1.0
 
@@ -235,13 +235,13 @@ def angle_lines(kinematics: Kinematics, recorded: Table, q: Array) -> tuple[str,
         q: coordinates from the table, rad and m, shape (f, n).
     """
     coordinates = kinematics.model.coordinates
-    own = [kinematics.coordinates[name] for name in coordinates if coordinates[name].rotational]
-    turns = np.ptp(q[:, own], axis=0) / DEGREE
-    small = np.abs(q[:, own]).max() < ANGLE_UNIT.max_radians * DEGREE
+    angles = [kinematics.coordinates[name] for name in coordinates if coordinates[name].rotational]
+    turns = np.ptp(q[:, angles], axis=0) / DEGREE
+    small = np.abs(q[:, angles]).max() < ANGLE_UNIT.max_radians * DEGREE
     if recorded.in_degrees and small and turns.max() > ANGLE_UNIT.min_rotation_deg:
         return (
-            "ATTENTION: by inDegrees=yes no joint of the whole motion bends or turns by more than "
-            f"{turns.max():.2g} deg: check whether the file is in radians",
+            "ATTENTION: with inDegrees=yes no joint rotates by more than "
+            f"{turns.max():.2g} deg in the whole motion: check whether the file is in radians",
         )
     return ()
 
@@ -263,17 +263,19 @@ def coordinate_motion(
         kinematics: the chain of the model.
         time: times of the samples, s, shape (m,).
         q: coordinates, rad and m, shape (m, n). Values of dependent coordinates are ignored.
-        cutoff_Hz: cut-off frequency, as in `differentiate_coordinates`, which raises the errors.
+        cutoff_Hz: cut-off frequency, Hz, as in `differentiate_coordinates`.
         at: times of the result, s, shape (f,); None: `time`.
         name: name of the data in messages.
     """
     values, rates, second = differentiate_coordinates(time, q, cutoff_Hz, at, name=name)
     for coupler in kinematics.model.couplers:
         dependent = kinematics.coordinates[coupler.dependent]
-        own = kinematics.coordinates[coupler.independent]
-        slope = coupler.function.slope(values[:, own])
-        bend = coupler.function.curvature(values[:, own])
-        values[:, dependent] = coupler.function(values[:, own])
-        rates[:, dependent] = slope * rates[:, own]
-        second[:, dependent] = slope * second[:, own] + bend * rates[:, own] ** 2
+        independent = kinematics.coordinates[coupler.independent]
+        slope = coupler.function.slope(values[:, independent])
+        curvature = coupler.function.curvature(values[:, independent])
+        values[:, dependent] = coupler.function(values[:, independent])
+        rates[:, dependent] = slope * rates[:, independent]
+        second[:, dependent] = (
+            slope * second[:, independent] + curvature * rates[:, independent] ** 2
+        )
     return CoordinateMotion(time if at is None else np.asarray(at, float), values, rates, second)

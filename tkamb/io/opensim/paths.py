@@ -88,12 +88,12 @@ class Tension:
         self.lengths[rows, first] += distance
         self.pulls[rows, first] += u
         self.pulls[rows, second] -= u
-        self._keep(rows, self.lines[first], self.bodies[first], self.bodies[second], start, end)
+        self._add_part(rows, self.lines[first], self.bodies[first], self.bodies[second], start, end)
 
     def pull_wrapped(
-        self, rows: Index, k: int, there: Index, strings: WrappedStrings, bodies: Index
+        self, rows: Index, k: int, next_point: Index, strings: WrappedStrings, bodies: Index
     ) -> None:
-        """Add strings from path point k to points `there` in frames `rows`, over wrap objects.
+        """Add strings from path point k to points `next_point` in frames `rows`, over wrap objects.
 
         `bodies` are the indices of the wrap objects' bodies.
         """
@@ -103,23 +103,24 @@ class Tension:
             upcoming = strings.order[at, gap] if gap < len(bodies) else np.full(len(rows), -1)
             touching = upcoming >= 0
             target = np.where(
-                touching[:, None], strings.entry[at, upcoming], self.points[rows, there]
+                touching[:, None], strings.entry[at, upcoming], self.points[rows, next_point]
             )
             u, distance = _direction(place, target)
             self.lengths[rows, k] += distance
             behind = np.full(len(rows), self.bodies[k]) if gap == 0 else bodies[last]
-            ahead = np.where(touching, bodies[upcoming], self.bodies[there])
-            self._keep(rows, np.full(len(rows), owner), behind, ahead, place, target)
+            ahead = np.where(touching, bodies[upcoming], self.bodies[next_point])
+            self._add_part(rows, np.full(len(rows), owner), behind, ahead, place, target)
             if gap == 0:
                 self.pulls[rows, k] += u
             else:
                 self._press(owner, rows, behind, place, u)
-            on = touching
-            self._press(owner, rows[on], ahead[on], target[on], -u[on])
-            self.pulls[rows[~on], there[~on]] -= u[~on]
-            rows, there, last, at = rows[on], there[on], upcoming[on], at[on]
+            free = ~touching
+            self._press(owner, rows[touching], ahead[touching], target[touching], -u[touching])
+            self.pulls[rows[free], next_point[free]] -= u[free]
+            rows, next_point = rows[touching], next_point[touching]
+            last, at = upcoming[touching], at[touching]
             self.lengths[rows, k] += strings.arc_m[at, last]
-            for end, points in enumerate((np.full(len(rows), k), there)):
+            for end, points in enumerate((np.full(len(rows), k), next_point)):
                 push = strings.push[at, last, end]
                 self.pulls[rows, points] += push
                 self._press(owner, rows, bodies[last], self.points[rows, points], -push)
@@ -147,7 +148,7 @@ class Tension:
     def _press(self, owner: int, rows: Index, bodies: Index, points: Array, forces: Array) -> None:
         self.wrenches[rows, owner, bodies] += np.hstack([np.cross(points, forces), forces])
 
-    def _keep(self, *part: Array | Index) -> None:
+    def _add_part(self, *part: Array | Index) -> None:
         self._parts.append(part)  # type: ignore[arg-type]
 
 
@@ -168,8 +169,8 @@ class PathSettings:
     condition_tolerance: float = 1e-5
     """rad or m: margin of the range of a conditional path point, as in OpenSim."""
     block_frames: int = 256
-    """frames: number that is evaluated in one call. It does not change the result. Chosen because
-    it limits the arrays to some tens of megabytes."""
+    """Number of frames that are evaluated in one call. It does not change the result. Chosen
+    because it limits the arrays to some tens of megabytes."""
 
 
 PATH = PathSettings()
@@ -276,8 +277,8 @@ class LineSet:
 
     def _joined(self, q: Array, *columns: Sequence[Array]) -> list[Array]:
         """Join blocks (f, m, ...) to arrays with the leading shape of q."""
-        whole = [np.concatenate(parts) for parts in columns]
-        return [values.reshape(*q.shape[:-1], *values.shape[1:]) for values in whole]
+        arrays = [np.concatenate(parts) for parts in columns]
+        return [values.reshape(*q.shape[:-1], *values.shape[1:]) for values in arrays]
 
     def _measure(self, q: Array) -> tuple[Array, Array, Tension]:
         """Return lengths (f, m), moment arms (f, m, n) and forces at coordinates q (f, n)."""
@@ -303,8 +304,8 @@ class LineSet:
         twists = motion.twists.reshape(len(q), -1, q.shape[1])
         arms = work.wrenches.reshape(shape) @ twists
         for k, c, rate in rates:
-            moved = np.einsum("fij,fj->fi", poses[:, k, :3, :3], rate)
-            arms[:, self._owner[k], c] += (work.pulls[:, k] * moved).sum(axis=1)
+            velocity = np.einsum("fij,fj->fi", poses[:, k, :3, :3], rate)
+            arms[:, self._owner[k], c] += (work.pulls[:, k] * velocity).sum(axis=1)
         lengths = np.add.reduceat(work.lengths, self._first, axis=1)
         arms[np.isnan(lengths)] = np.nan
         return lengths, arms, work
@@ -356,24 +357,24 @@ class LineSet:
         first: int,
         k: int,
         rows: Index,
-        there: Index,
+        next_point: Index,
         motion: Motion,
         work: Tension,
     ) -> None:
-        """Add strings from point k to points `there` in frames `rows`, over the path's wraps."""
+        """Add strings from point k to points `next_point` in frames `rows`, over the wraps."""
         objects = self.kinematics.model.wrap_objects
         usable = [w for w in path.wraps if first + w.first <= k and objects[w.wrap_object].active]
         wraps = [objects[w.wrap_object] for w in usable]
         if not wraps:
-            work.pull(rows, np.full(len(rows), k), there)
+            work.pull(rows, np.full(len(rows), k), next_point)
             return
         bodies = [self.kinematics.bodies[wrap.body] for wrap in wraps]
         poses = motion.poses[rows[:, None], np.array(bodies)] @ np.stack(
             [wrap.pose for wrap in wraps]
         )
-        allowed = there[:, None] <= first + np.array([w.last for w in usable])
-        start, end = work.points[rows, k], work.points[rows, there]
-        ends = np.stack([np.full(len(rows), self._body[k]), self._body[there]], axis=1)
+        allowed = next_point[:, None] <= first + np.array([w.last for w in usable])
+        start, end = work.points[rows, k], work.points[rows, next_point]
+        ends = np.stack([np.full(len(rows), self._body[k]), self._body[next_point]], axis=1)
         moves = ends[:, None, :] != np.array(bodies)[:, None]
         result = strings_over(wraps, poses, start, end, allowed, moves)
-        work.pull_wrapped(rows, k, there, result, np.array(bodies))
+        work.pull_wrapped(rows, k, next_point, result, np.array(bodies))

@@ -110,9 +110,9 @@ def _concerns(
     texts = [part for e in element.iter() for part in ((e.text or ""), e.get("name", ""))]
     words = {word for text in texts for word in text.replace("/", " ").split()}
     named = {word for word in words if word in frames.bodies or word in coordinates}
-    own = element.get("name", "")
+    user = element.get("name", "")
     for owner, name in frames.offsets:
-        if name in words and (owner == own or (own, name) not in frames.offsets):
+        if name in words and (owner == user or (user, name) not in frames.offsets):
             with suppress(InputError):
                 named.add(frames.resolve(element, name, owner)[0])
     return frozenset(named - {GROUND})
@@ -126,7 +126,9 @@ def _opened(root: Element, path: Path, partial: bool) -> tuple[Document, Element
     """
     model = root.find("Model")
     if root.tag != "OpenSimDocument" or model is None:
-        raise InputError(f"is not an OpenSim model: its root is <{root.tag}>", path)
+        raise InputError(
+            f"is not an OpenSim model: its root is <{root.tag}>", path, "give an .osim file"
+        )
     version = root.get("Version", "")
     if not version.isdigit() or int(version) < MODEL_READ.oldest_version:
         raise InputError(
@@ -153,7 +155,7 @@ def _bodies(document: Document, model: Element) -> dict[str, Body]:
         if element.tag != "Body":
             raise InputError("is a kind of body that is not read", document.where(element))
         if name in bodies:
-            raise InputError("is there twice", document.where(element), "rename one")
+            raise InputError("is defined twice", document.where(element), "rename one")
         if name != GROUND:
             mass = document.number(element, "mass")
             centre = document.numbers(element, "mass_center", count=3, default="0 0 0")
@@ -218,22 +220,22 @@ def _check_follower(
         raise InputError(
             f"makes '{new.dependent}' depend on a second coordinate", document.where(element)
         )
-    above: str | None = new.independent
-    while above is not None and above != new.dependent:
-        above = leads.get(above)
-    if above is not None:
+    lead: str | None = new.independent
+    while lead is not None and lead != new.dependent:
+        lead = leads.get(lead)
+    if lead is not None:
         raise InputError(f"makes '{new.dependent}' depend on itself", document.where(element))
 
 
 def _followers_last(couplers: list[CoordinateCoupler]) -> tuple[CoordinateCoupler, ...]:
     """Return the couplers, ordered so that each coordinate is set before others depend on it."""
     ordered: list[CoordinateCoupler] = []
-    waiting = list(couplers)
-    while waiting:
-        still_to_be_set = {coupler.dependent for coupler in waiting}
-        ready = [c for c in waiting if c.independent not in still_to_be_set]
+    remaining = list(couplers)
+    while remaining:
+        unset = {coupler.dependent for coupler in remaining}
+        ready = [c for c in remaining if c.independent not in unset]
         ordered += ready
-        waiting = [c for c in waiting if c not in ready]
+        remaining = [c for c in remaining if c not in ready]
     return tuple(ordered)
 
 
@@ -245,7 +247,7 @@ def _coupler(
     for name in (*independent, dependent):
         if name not in coordinates:
             raise InputError(
-                f"names a coordinate '{name}' that is not there", document.where(element)
+                f"names a coordinate '{name}' that does not exist", document.where(element)
             )
     function = document.held_function(element, "coupled_coordinates_function")
     if len(independent) != 1 or function is None:
@@ -280,10 +282,11 @@ def _markers(document: Document, model: Element, frames: Frames) -> dict[str, Ma
             marker = Marker(name, *frames.point(element, socket, location), fixed)
             other = markers.pop(name, None)
             if other is not None and not _same_place(marker, other):
-                raise InputError("is there twice", document.where(element), "rename one")
+                raise InputError("is defined twice", document.where(element), "rename one")
             markers[name] = marker
     return markers
 
 
-def _same_place(one: Marker, other: Marker) -> bool:
-    return one.body == other.body and np.allclose(one.location, other.location, atol=1e-9, rtol=0)
+def _same_place(marker: Marker, other: Marker) -> bool:
+    same_location = np.allclose(marker.location, other.location, atol=1e-9, rtol=0)
+    return marker.body == other.body and same_location

@@ -90,8 +90,8 @@ class Frames:
         in_body = np.eye(4)
         for _ in range(len(self.offsets) + 1):
             name = steps[-1] if steps else owner  # ".." is the owner of the frame
-            above = steps[-2] if len(steps) > 1 else owner
-            key = (above, name) if (above, name) in self.offsets else ("", name)
+            owner_name = steps[-2] if len(steps) > 1 else owner
+            key = (owner_name, name) if (owner_name, name) in self.offsets else ("", name)
             if key not in self.offsets:
                 if name in self.bodies:
                     return name, in_body
@@ -102,7 +102,7 @@ class Frames:
             in_body = pose_in_parent @ in_body
             steps = [step for step in parent.split("/") if step not in ("", ".", "..")]
             owner = key[0]
-        raise InputError(f"names a frame '{socket}' that is not there", self.document.where(user))
+        raise InputError(f"names a frame '{socket}' that does not exist", self.document.where(user))
 
     def point(self, user: Element, socket: str, location: Array) -> tuple[str, Array]:
         """Convert a point (3,), m, of a socket's frame to its body. Return body and point."""
@@ -144,12 +144,13 @@ def _station_defined(
     where, points, parents = document.where(element), [], set()
     for name in ("point_a", "point_b", "point_c", "origin_point"):
         socket = document.socket(element, name)
-        known_frames = stations.get(socket.rstrip("/").split("/")[-1], [])
-        own = [s for s in known_frames if s in element.iter()] or known_frames
-        if len(own) != 1:
-            raise InputError(f"names a station '{socket}', of which there are {len(own)}", where)
-        points.append(document.numbers(own[0], "location", count=3))
-        parents.add(document.socket(own[0], "parent_frame", "body", default=".."))
+        candidates = stations.get(socket.rstrip("/").split("/")[-1], [])
+        matches = [s for s in candidates if s in element.iter()] or candidates
+        if len(matches) != 1:
+            what = f"names a station '{socket}', of which there are {len(matches)}"
+            raise InputError(what, where)
+        points.append(document.numbers(matches[0], "location", count=3))
+        parents.add(document.socket(matches[0], "parent_frame", "body", default=".."))
     if len(parents) != 1:
         raise InputError("has stations in different frames, which is not read", where)
     a, b, c, origin = points
@@ -185,12 +186,12 @@ def read_joints(
     coordinates: dict[str, Coordinate] = {}
     for element, child in _joint_elements(document, model):
         with document.reading(element):
-            joint, own = _joint(document, element, frames, child)
-            if twice := [name for name in own if name in coordinates]:
-                where = f"{document.where(element)}: Coordinate '{twice[0]}'"
-                raise InputError("is there twice", where, "rename one")
+            joint, joint_coordinates = _joint(document, element, frames, child)
+            if duplicates := [name for name in joint_coordinates if name in coordinates]:
+                where = f"{document.where(element)}: Coordinate '{duplicates[0]}'"
+                raise InputError("is defined twice", where, "rename one")
             joints.append(joint)
-            coordinates |= own
+            coordinates |= joint_coordinates
     return joints, coordinates
 
 
@@ -208,16 +209,17 @@ def _joint(
         axes = (_custom_axes if custom else _standard_axes)(document, element, names)
     unread = "; ".join(reason for _, reason in document.unread[read_before:])
     name = document.name(element)
-    coordinates = {axis.coordinate for kind in axes for axis in kind}
-    own = {}
+    moving = {axis.coordinate for kind in axes for axis in kind}
+    coordinates = {}
     for entry in entries:
         coordinate = _coordinate(document, entry, name, axes[0])
-        if coordinate.name in own:
-            raise InputError("is there twice", document.where(entry), "rename one")
-        # A coordinate without an axis moves no body, so that it is treated as locked.
-        still = coordinate.name not in coordinates
-        own[coordinate.name] = replace(coordinate, locked=True) if still else coordinate
-    return Joint(name, element.tag, parent, body, in_parent, in_child, *axes, unread=unread), own
+        if coordinate.name in coordinates:
+            raise InputError("is defined twice", document.where(entry), "rename one")
+        # A coordinate without an axis moves no body. It is treated as locked.
+        is_idle = coordinate.name not in moving
+        coordinates[coordinate.name] = replace(coordinate, locked=True) if is_idle else coordinate
+    joint = Joint(name, element.tag, parent, body, in_parent, in_child, *axes, unread=unread)
+    return joint, coordinates
 
 
 def _joint_elements(document: Document, model: Element) -> Iterator[tuple[Element, str | None]]:
@@ -363,7 +365,7 @@ def outwards(document: Document, joints: list[Joint], bodies: Iterable[str]) -> 
 def _hold_still(
     document: Document, body: str, reason: str, ordered: list[Joint], hint: str | None = None
 ) -> None:
-    """Weld a body to ground and record the reason. Unless the reading is partial, raise."""
+    """Weld a body to ground and record the reason. This is an error unless `partial`."""
     weld = Element("WeldJoint", {"name": f"{body} held still"})
     weld.text = body
     with document.reading(weld):

@@ -132,7 +132,7 @@ def read_forces(
 
 def _check_new(document: Document, element: Element, names: set[str]) -> None:
     if document.name(element) in names:
-        raise InputError("is there twice", document.where(element), "rename one")
+        raise InputError("is defined twice", document.where(element), "rename one")
 
 
 def _enabled(document: Document, element: Element) -> bool:
@@ -213,9 +213,8 @@ class _PathReader:
             raise InputError("has fewer than two path points", document.where(element))
         wraps = []
         for entry in document.objects(geometry, "PathWrapSet"):
-            with document.reading(
-                element
-            ):  # in a partial reading, the path then has no such wrap object
+            # After a partial reading the path lacks a wrap object that could not be read.
+            with document.reading(element):
                 wraps.append(self._wrap(element, entry, len(points)))
         return Path(points, tuple(wraps))
 
@@ -257,7 +256,7 @@ class _PathReader:
         socket = self.document.socket(entry, name, name, default=" ").strip()
         name = socket.split("/")[-1]
         if name and name not in self.coordinates:
-            raise InputError(f"names a coordinate '{socket}' that is not there", where)
+            raise InputError(f"names a coordinate '{socket}' that does not exist", where)
         return name or None
 
     def _wrap(self, owner: Element, entry: Element, count: int) -> PathWrap:
@@ -268,7 +267,7 @@ class _PathReader:
         method = "hybrid" if method == "unassigned" else method
         first, last = document.numbers(entry, "range", count=2, default="-1 -1").astype(int)
         if name not in self.wraps:
-            raise InputError(f"names a wrap object '{name}' that is not there", where)
+            raise InputError(f"names a wrap object '{name}' that does not exist", where)
         if method not in METHODS:
             raise InputError(f"has a method '{method}' that is not read", where)
         # The file counts points from 1; a smaller number means the first or the last point.

@@ -1,10 +1,10 @@
 """Taut strings between two points over wrap objects: cylinder, sphere, ellipsoid, torus.
 
 The strings around a single object are computed in its frame, many strings at once. A string touches
-an object if the straight line would pass through it. If the half of the object is prescribed, a
+an object if the straight line would pass through it. If the half of a cylinder is prescribed, a
 string also touches if the straight line passes on the wrong side. A string with an end inside the
-object ignores the object, as in OpenSim. Each string is the shortest, so that dL/dq follows from
-its directions at the ends alone.
+object ignores the object, as in OpenSim (ellipsoids: see below). Each string is the shortest, so
+that dL/dq follows from its directions at the ends alone.
 
 Let r be the radius of a circle, d₁ and d₂ the distances of the string's ends from its centre, and Δ
 the angle between the ends. The arc θ and the length S are
@@ -120,10 +120,10 @@ def _around(
         start to the touching point, rad; lengths of the two straight parts (f,), m.
     """
     first, second = (np.sqrt(np.maximum(d**2 - radius**2, 0.0)) for d in distances)
-    away = np.arctan2(first, radius), np.arctan2(second, radius)
-    turn = np.sign(sweep) * np.maximum(np.abs(sweep) - away[0] - away[1], 0.0)
+    tangent_angles = np.arctan2(first, radius), np.arctan2(second, radius)
+    turn = np.sign(sweep) * np.maximum(np.abs(sweep) - tangent_angles[0] - tangent_angles[1], 0.0)
     outside = (distances[0] >= radius) & (distances[1] >= radius)
-    return np.where(outside, turn, 0.0), np.sign(sweep) * away[0], (first, second)
+    return np.where(outside, turn, 0.0), np.sign(sweep) * tangent_angles[0], (first, second)
 
 
 def _cylinder(
@@ -147,16 +147,16 @@ def _cylinder(
         np.column_stack([radius * np.cos(a), radius * np.sin(a), z])
         for a, z in zip((angle + ahead, angle + ahead + turn), heights, strict=True)
     )
-    off = np.minimum(np.abs(heights[0]), np.abs(heights[1])) > length / 2.0
+    is_beyond = np.minimum(np.abs(heights[0]), np.abs(heights[1])) > length / 2.0
     arc = on_circle * np.hypot(1.0, rise)
-    return WrapTouch((turn != 0.0) & ~off, entry, leave, arc, _no_push(start))
+    return WrapTouch((turn != 0.0) & ~is_beyond, entry, leave, arc, _no_push(start))
 
 
 def _sphere(start: Array, end: Array, radius: float, quadrant: tuple[int, int] | None) -> WrapTouch:
     """Return strings around a sphere, each in the plane of its ends and the centre.
 
-    If a half is prescribed and the short way passes on the other half, a string takes the long way.
-    It takes the short way if both ends lie on the prescribed half.
+    If the short way passes on the half that is not prescribed, a string takes the long way, unless
+    both of its ends lie on the prescribed half.
     """
     near, far = np.linalg.norm(start, axis=1), np.linalg.norm(end, axis=1)
     along, towards = start / near[:, None], end / far[:, None]
@@ -205,9 +205,9 @@ def _torus(start: Array, end: Array, ring: float, tube: float) -> WrapTouch:
     high = low + 2.0 * tried[1]
     golden = 0.5 * (np.sqrt(5.0) - 1.0)
     for _ in range(40):
-        left, right = high - golden * (high - low), low + golden * (high - low)
-        shorter = at(left)[1] < at(right)[1]
-        low, high = np.where(shorter, left, low), np.where(shorter, high, right)
+        inner_low, inner_high = high - golden * (high - low), low + golden * (high - low)
+        shorter = at(inner_low)[1] < at(inner_high)[1]
+        low, high = np.where(shorter, inner_low, low), np.where(shorter, high, inner_high)
     result, lengths, frame = at(0.5 * (low + high))
     centre = -ring * frame[rows, 0]
     entry, leave = (np.einsum("fji,fj->fi", frame, p) + centre for p in (result.entry, result.exit))
@@ -305,30 +305,31 @@ def strings_over(
     strings = _Strings(wraps, poses, start, end, moves)
     if len(wraps) == 1:
         strings.insert(0, np.flatnonzero(allowed[:, 0]))
-        return strings.found()
-    live = np.arange(len(start))
+        return strings.result()
+    active = np.arange(len(start))
     point, order = strings.places(), strings.order.copy()
     value = residual = np.full_like(point, np.nan)
     for _ in range(STRING.max_sweeps):
-        strings.sweep(live, allowed)
+        strings.sweep(active, allowed)
         same = (strings.order == order).all(axis=1)
         order, (last_value, last_residual) = strings.order.copy(), (value, residual)
         value = strings.places()
         residual = np.where(same[:, None], value - point, np.nan)
-        live = live[~(np.abs(residual[live]).max(axis=1) < STRING.tolerance)]
-        if not len(live):
+        active = active[~(np.abs(residual[active]).max(axis=1) < STRING.tolerance)]
+        if not len(active):
             break
         point = value.copy()
-        point[live] += _leap(value, last_value, residual, last_residual)[live]
+        point[active] += _leap(value, last_value, residual, last_residual)[active]
         strings.place(point)
-    strings.arc[live] = np.nan
-    return strings.found()
+    strings.arc[active] = np.nan
+    return strings.result()
 
 
 def _leap(value: Array, last_value: Array, residual: Array, last_residual: Array) -> Array:
     """Return the extrapolation (f, 6w), m, from the last two sweeps (Aitken, Anderson).
 
-    It is zero until two sweeps touch the same objects, and if it would be too large.
+    The extrapolation is zero until two sweeps touch the same objects, or if it would exceed
+    `max_extrapolation`.
     """
     change = residual - last_residual
     squared = np.maximum((change**2).sum(axis=1), 1e-300)
@@ -351,7 +352,7 @@ class _Strings:
         self.entry, self.exit = np.zeros((*shape, 3)), np.zeros((*shape, 3))
         self.arc, self.push = np.zeros(shape), np.zeros((*shape, 2, 3))
 
-    def found(self) -> WrappedStrings:
+    def result(self) -> WrappedStrings:
         """Return the strings as a result."""
         return WrappedStrings(self.order, self.entry, self.exit, self.arc, self.push)
 
@@ -395,12 +396,12 @@ class _Strings:
             self._touch(w, gap, free[result.touches], result)
             free = free[~result.touches]
 
-    def _touch(self, w: int, gap: int, rows: Index, found: WrapTouch) -> None:
-        on, poses = found.touches, self.poses[rows, w]
-        self.entry[rows, w] = _moved(poses, found.entry[on])
-        self.exit[rows, w] = _moved(poses, found.exit[on])
-        self.arc[rows, w] = found.arc_m[on]
-        self.push[rows, w] = np.einsum("fij,fej->fei", poses[:, :3, :3], found.push[on])
+    def _touch(self, w: int, gap: int, rows: Index, contact: WrapTouch) -> None:
+        touches, poses = contact.touches, self.poses[rows, w]
+        self.entry[rows, w] = _moved(poses, contact.entry[touches])
+        self.exit[rows, w] = _moved(poses, contact.exit[touches])
+        self.arc[rows, w] = contact.arc_m[touches]
+        self.push[rows, w] = np.einsum("fij,fej->fei", poses[:, :3, :3], contact.push[touches])
         later = self.order[rows, gap:-1]
         self.order[rows, gap:] = np.column_stack([np.full(len(rows), w), later])
 

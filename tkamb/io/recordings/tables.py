@@ -209,7 +209,7 @@ def read_csv(path: Path) -> Table:
         if line.strip() and not line.lstrip().startswith("#")
     ]
     if not rows:
-        raise InputError("is empty", path)
+        raise InputError("is empty", path, "export the recording again")
     names = [name.strip() for name in rows[0][1]]
     for sign, word in ((";", "semicolons"), ("\t", "tabs")):
         if len(names) == 1 and sign in names[0]:
@@ -393,7 +393,7 @@ def _columns(
 ) -> tuple[dict[str, Array], tuple[str, ...]]:
     """Return name -> values (n,), and the names that several columns share."""
     if not rows:
-        raise InputError("has no data rows", path)
+        raise InputError("has no data rows", path, "export the recording again")
     counts = Counter(names)
     values = np.empty((len(rows), len(names)))
     for k, (number, cells) in enumerate(rows):

@@ -54,8 +54,8 @@ class Case:
         measured: forces that an instrumented implant measured.
         emg: envelopes of the muscles' surface EMG.
         post: the insert's post in the insert frame, if the scene has [contact] post.
-        insert_placement: pose in the insert frame of the insert's mesh, turned to anatomical axes
-            about the mesh origin and not mirrored, m, shape (4, 4); None if not needed.
+        insert_placement: pose of the insert's mesh in the insert frame, after the mesh is turned
+            to anatomical axes about its origin, not mirrored, m, shape (4, 4); None if not needed.
     """
 
     scene: Scene
@@ -90,7 +90,7 @@ class Case:
         """
         cutoff = self.scene.motion.cutoff_Hz
         check_frames(self.motion.time, cutoff, self.scene.motion.frames)
-        return differentiate_coordinates(time, places, cutoff, name="places of the patella")
+        return differentiate_coordinates(time, places, cutoff, name="positions of the patella")
 
     @property
     def gait_cycle_s(self) -> tuple[float, float] | None:
@@ -164,8 +164,9 @@ def _recordings(
 def _common_part(scene: Scene) -> MotionTable | None:
     """Return the table [motion] with the interval that the ground reaction covers.
 
-    A scene without an interval uses the whole recording, but its two files may begin and end at
-    slightly different times. The result is None if the interval cannot or need not be changed.
+    A scene without an interval uses the whole recording, but motion and ground reaction may begin
+    and end at slightly different times. The result is None if the interval cannot or need not be
+    changed.
     """
     if scene.ground_reaction is None or scene.motion.interval_s or scene.motion.cycle_s:
         return None
@@ -196,7 +197,7 @@ def load_case(scene: Scene) -> Case:
     """
     with_patella = scene.patella is not None
     chain = Chain(load_urdf(scene.patient, with_patella), with_patella)
-    # Meshes take longer to read than tables. Tables come first, so that their errors come at once.
+    # Meshes take longer to read than tables. Tables come first: their errors then appear at once.
     parts = ImplantParts(scene) if scene.motion.interpretation == "pose" else None
     try:
         motion, tibia, ground = _recordings(scene, scene.motion, chain, parts)

@@ -35,10 +35,12 @@ def seated_motion(
     places = motion.coordinates.copy()
     lowest = LowestPoints(femoral, condyle_split(femoral))
     touch = FirstTouch(femoral, insert)
-    over = [(i, KNEE_COORDINATES.index(name), name) for i, name in ((0, "ap"), (2, "ml"))]
+    horizontal_axes = [
+        (i, KNEE_COORDINATES.index(name), name) for i, name in ((0, "ap"), (2, "ml"))
+    ]
     for place in places:
         points = [point for point in lowest.at(knee_pose(place)) if point is not None]
-        for axis, index, name in over:
+        for axis, index, name in horizontal_axes:
             if name in motion.unrecorded:
                 place[index] -= np.mean(points, axis=0)[axis]
         if "si" in motion.unrecorded:
@@ -81,7 +83,7 @@ def rolling_motion(
         raise InputError(
             f"the femur rolls off the insert at {gap:.3g} s",
             "[motion] motion = 'roll-slip'",
-            "give it more of the recorded slip (slip_share) or take motion = 'recorded'",
+            "increase slip_share, or take motion = 'recorded'",
         )
     return _with_coordinates(motion, rolled, [0, 1], cutoff)
 

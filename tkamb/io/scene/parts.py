@@ -56,7 +56,7 @@ class ImplantParts:
         if wants_insert:
             if not implant.insert:
                 raise InputError(
-                    "interpretation = 'pose' is in the insert mesh's axes",
+                    "interpretation = 'pose' refers to the insert mesh's axes",
                     "[motion]",
                     "give [implant.insert] and [implant.femoral]",
                 )

@@ -29,16 +29,16 @@ def scaled_case(case: "Case") -> "Case":
     """Return the case at the size of its scene's `[patient] scale`.
 
     Raises:
-        InputError: the scene has [muscles], markers or [measured], which are of the unscaled
+        InputError: the scene has [muscles], markers or [measured], which belong to the unscaled
             subject.
     """
     s = case.scene.patient.scale
-    for place, table in (
+    for content, table in (
         (case.scene.muscles, "[muscles]"),
         (case.motion.markers, "[motion.markers]"),
         (case.scene.measured, "[measured]"),
     ):
-        if place is not None:
+        if content is not None:
             what, hint = f"cannot scale a scene with {table}", "scale its models, or leave it out"
             raise InputError(what, "[patient] scale", hint)
     return replace(
@@ -51,8 +51,8 @@ def scaled_case(case: "Case") -> "Case":
         insert=_surface(case.insert, s),
         patella=_surface(case.patella, s),
         post=_surface(case.post, s),
-        ligaments=tuple(_ligament(one, s) for one in case.ligaments),
-        muscles=tuple(_muscle(one, s) for one in case.muscles),
+        ligaments=tuple(_ligament(bundle, s) for bundle in case.ligaments),
+        muscles=tuple(_muscle(muscle, s) for muscle in case.muscles),
         patellar_ligament=_patellar_ligament(case.patellar_ligament, s),
     )
 

@@ -96,8 +96,8 @@ class Scene(SceneTable):
     @property
     def yield_stress_MPa(self) -> float:
         """Yield stress of the insert, from [material] or else [output]."""
-        own = self.material.yield_stress_MPa if self.material else None
-        return self.output.yield_stress_MPa if own is None else own
+        stress = self.material.yield_stress_MPa if self.material else None
+        return self.output.yield_stress_MPa if stress is None else stress
 
     @property
     def preset(self) -> "AppliedPreset | None":
@@ -126,7 +126,7 @@ class Scene(SceneTable):
                 raise ValueError(f"'{name}' is in [generic_ligaments] and in [[ligament]]")
         muscles = [muscle.name for muscle in self.muscle] + ["quadriceps"] * bool(self.quadriceps)
         if len(muscles) != len(set(muscles)):
-            raise ValueError("two muscles have the same name; [quadriceps] is one of that name")
+            raise ValueError("two muscles have the same name; [quadriceps] is named quadriceps")
         parts = (muscles, self.patellar_ligament, self.patella)
         if any(parts) and not all(parts):
             raise ValueError(
@@ -156,11 +156,11 @@ class Scene(SceneTable):
         if self.material and not contact:
             raise ValueError("[material] needs [contact], which uses it")
         if self.output.cycle_s and self.motion.cycle_s:
-            raise ValueError("[motion] cycle_s is the cycle: drop [output] cycle_s")
+            raise ValueError("[motion] cycle_s already states the cycle: drop [output] cycle_s")
         if self.tibia and self.motion.markers:
             raise ValueError("[motion.markers] places the shank too: drop [tibia]")
         if self.ground_reaction and not (self.tibia or self.motion.markers):
-            raise ValueError("[ground_reaction] needs [tibia]: how the shank stands in the lab")
+            raise ValueError("[ground_reaction] needs [tibia], the shank's pose in the laboratory")
         return self
 
 
@@ -208,9 +208,9 @@ def with_preset(scene: Scene, preset: str, overrides: dict[str, Any] | None = No
     content = scene.model_dump(exclude_unset=True)
     more = scene.overrides | (overrides or {})
     applied = _apply_preset(content, preset, more, "scene")
-    found = _changed(content, more)
-    found._preset = applied
-    return found
+    result = _changed(content, more)
+    result._preset = applied
+    return result
 
 
 def with_overrides(scene: Scene, overrides: dict[str, Any]) -> Scene:
@@ -223,9 +223,9 @@ def with_overrides(scene: Scene, overrides: dict[str, Any]) -> Scene:
     Raises:
         InputError: a key is unknown, or a value is out of range.
     """
-    found = _changed(scene.model_dump(exclude_unset=True), scene.overrides | overrides)
-    found._preset = scene.preset
-    return found
+    result = _changed(scene.model_dump(exclude_unset=True), scene.overrides | overrides)
+    result._preset = scene.preset
+    return result
 
 
 def _changed(content: dict[str, Any], overrides: dict[str, Any]) -> Scene:
@@ -251,8 +251,8 @@ def _apply_overrides(content: dict[str, Any], overrides: Mapping[str, Any]) -> N
         _drop(content, "contact", "material")
     elif "contact.material" in overrides and "material" not in tables:
         content.pop("material", None)
-    own = content.get("material")
-    has_yield = isinstance(own, dict) and "yield_stress_MPa" in own
+    material = content.get("material")
+    has_yield = isinstance(material, dict) and "yield_stress_MPa" in material
     if "material" in tables and has_yield and "output.yield_stress_MPa" not in overrides:
         _drop(content, "output", "yield_stress_MPa")
 
@@ -286,14 +286,14 @@ def _content(path: Path) -> dict[str, Any]:
         raise InputError("'base' is not a file name", path, "name a scene file in the same folder")
     base = _parse(path.parent / name)
     if "base" in base:
-        raise InputError(f"its base {name} has a base itself", path, "name that one")
+        raise InputError(f"its base {name} has a base itself", path, "name that base instead")
     return _merge(base, content)
 
 
-def _merge(base: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
-    """Return the keys of `base`, replaced by the keys of `own`. Tables are merged."""
-    merged = base | own
-    for key, value in own.items():
+def _merge(base: dict[str, Any], content: dict[str, Any]) -> dict[str, Any]:
+    """Return the keys of `base`, replaced by the keys of `content`. Tables are merged."""
+    merged = base | content
+    for key, value in content.items():
         if isinstance(value, dict) and isinstance(base.get(key), dict):
             merged[key] = _merge(base[key], value)
     return merged
@@ -323,24 +323,27 @@ def _complaint(error: ValidationError, path: Path, overrides: dict[str, Any]) ->
     """Return the error to correct first. Unknown keys come first: they may be misspelt keys."""
     result = error.errors()
     rank = {"extra_forbidden": 0, "missing": 2}
-    first = min(result, key=lambda one: rank.get(one["type"], 1))
+    first = min(result, key=lambda complaint: rank.get(complaint["type"], 1))
     key = ".".join(str(part) for part in first["loc"])
     option = next((o for o in overrides if f"{o}.".startswith(f"{key}.") or o == key), None)
     where = path if option is None else f"overrides {option}"
     more = f" ({len(result) - 1} more after this one)" if len(result) > 1 else ""
     if first["type"] == "extra_forbidden":
-        known = list(_keys_of(first["loc"][:-1]))
-        advice = names_near(str(first["loc"][-1]), known)
+        keys = list(_keys_of(first["loc"][:-1]))
+        advice = names_near(str(first["loc"][-1]), keys)
         return InputError(f"unknown key '{key}'", where, f"{advice}{_tables_with(first)}{more}")
     advice = f"`tkamb scene --schema` lists every key{more}"
     if first["type"] == "missing":
         return InputError(f"missing key '{key}'", where, advice)
     message = first["msg"].removeprefix("Value error, ")
+    message = message.removeprefix("Input ")
     if first["type"] in ("float_type", "int_type", "bool_type"):
         message += f", not {_shown(first['input'])}"
+    elif first["type"] == "literal_error":
+        message += f", not {first['input']!r}"
     if first["type"] in ("tuple_type", "list_type"):
         message = _as_list(key, first["input"], option == key)
-    return InputError(f"'{key}': {message}" if key else message, where, advice)
+    return InputError(f"'{key}': {message}" if key and option != key else message, where, advice)
 
 
 def _as_list(key: str, value: Any, from_command_line: bool) -> str:
@@ -386,9 +389,9 @@ def _table_in(annotation: Any) -> type[BaseModel] | None:
 def _tables_with(complaint: ErrorDetails) -> str:
     """Return words on the other tables that have an unknown key, or ""."""
     key = complaint["loc"][-1]
-    own = _model_at(complaint["loc"][:-1])
+    table = _model_at(complaint["loc"][:-1])
     tables = {name: _model_at((name,)) for name in Scene.model_fields}
-    named = [f"[{n}]" for n, m in tables.items() if m and m is not own and key in m.model_fields]
+    named = [f"[{n}]" for n, m in tables.items() if m and m is not table and key in m.model_fields]
     return f"; '{key}' is a key of {', '.join(named)}" if named else ""
 
 
@@ -402,5 +405,5 @@ def _resolve_paths(model: Any, folder: Path) -> Any:
         elif isinstance(value, SceneTable):
             changed[name] = _resolve_paths(value, folder)
         elif isinstance(value, tuple) and value and isinstance(value[0], SceneTable):
-            changed[name] = tuple(_resolve_paths(one, folder) for one in value)
+            changed[name] = tuple(_resolve_paths(table, folder) for table in value)
     return model.model_copy(update=changed) if changed else model

@@ -39,7 +39,9 @@ class FemoralImplantTable(SceneTable):
     position_mm: Offset = Field(
         (0.0, 0.0, 0.0), description="mesh origin in the femur link, anatomical axes"
     )
-    rotation_deg: Turn = Field((0.0, 0.0, 0.0), description="intrinsic x-y-z, after axes")
+    rotation_deg: Turn = Field(
+        (0.0, 0.0, 0.0), description="intrinsic x-y-z rotation of the mesh in anatomical axes"
+    )
 
 
 class InsertImplantTable(SceneTable):
@@ -140,12 +142,12 @@ class GenericLigamentsTable(SceneTable):
 
 
 class BoneTable(SceneTable):
-    """A bone's mesh, which a line may wrap beside the implant."""
+    """A bone's mesh, which a line may wrap as well as the implant."""
 
     mesh: Path
     unit: LengthUnit
     axes: Axes = "+x,+y,+z"
-    link: str = Field(description="the link whose frame the mesh is in")
+    link: str = Field(description="link in whose frame the mesh is")
 
 
 HALF_THICKNESS = "distance of the tendon's centre line from the outline"
@@ -206,8 +208,8 @@ class QuadricepsTable(SceneTable):
 class MusclesTable(SceneTable):
     """All muscles of the leg, from the OpenSim model that the URDF was made from.
 
-    They share the joint moments of hip, knee, ankle and subtalar joint by static optimisation;
-    those that cross the knee act on it. The equilibrium of the knee gives the quadriceps' force,
+    Static optimisation shares the moments of hip, knee, ankle and subtalar joint among the
+    muscles. Those across the knee load it. The equilibrium of the knee gives the quadriceps' force,
     see docs/muscles.md. Without this table only the quadriceps acts.
     """
 
@@ -219,12 +221,13 @@ class MusclesTable(SceneTable):
     )
     exponent: Number = Field(2.0, ge=2, le=10, description="p of the cost: sum of w a^p")
     weights: Literal["volume", "equal"] = Field(
-        "volume", description="w: optimal fibre length times strength over the mean, or 1"
+        "volume",
+        description="w: optimal fibre length times strength, over its mean (volume), or 1 (equal)",
     )
     reserve_Nm: Annotated[Number, Field(ge=0, le=10000)] | dict[str, Number] = Field(
         10.0,
         description="reserve moment that costs as much as one fully active muscle of weight 1: one "
-        "number for every balanced coordinate, or coordinate -> number; 0 forbids it",
+        "number for all balanced coordinates, or a table coordinate = number; 0: no reserve",
     )
     least_activation: Number = Field(
         0.0,
@@ -243,7 +246,7 @@ class MusclesTable(SceneTable):
 class PatellarLigamentTable(SceneTable):
     """Patellar ligament line: from the patella to the tibial tuberosity.
 
-    It wraps the insert's front lip when the insert is there.
+    It wraps the insert's front lip, if the scene has an insert.
     """
 
     proximal: Attachment
@@ -281,7 +284,9 @@ class ContactTable(SceneTable):
         "angle after the press exceed the adjustment (both, Sharma 2008), or if either does",
     )
     coupling: Literal["none", "points"] = Field(
-        "none", description="'points': the resultants of the deformed contact act in the equations"
+        "none",
+        description="'points': the resultants of the deformed contact act in the equations of "
+        "motion",
     )
     released: tuple[KneeFreedom, ...] = Field(
         (),
@@ -328,7 +333,7 @@ class MaterialTable(SceneTable):
     young_modulus_MPa: Annotated[Number | None, within(0.1, 500000, "give it in megapascals")] = (
         Field(
             None,
-            description="slope of the curve at the origin; default for a table: its own slope",
+            description="slope of the curve at the origin; default of a tabulated curve: its slope",
         )
     )
     poisson_ratio: Annotated[Number | None, Field(ge=0, lt=0.5)] = None

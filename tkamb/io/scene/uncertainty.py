@@ -1,7 +1,7 @@
 """The scene's table [uncertainty]: the standard deviation of the error of each input.
 
-Every key is one standard deviation of a normal distribution in the key's unit; those called
-relative are of a positive factor of mean 1 (lognormal). Zero: that input does not vary.
+Every key is the standard deviation of a normal error, in the key's unit. A key called relative is
+the standard deviation of a positive (lognormal) factor with mean 1. Zero: the input does not vary.
 """
 
 from dataclasses import asdict, dataclass
@@ -15,7 +15,7 @@ Length = Annotated[Number, Field(ge=0, le=50)]
 Angle = Annotated[Number, Field(ge=0, le=20)]
 Share = Annotated[Number, Field(ge=0, le=1)]
 
-_OF_POSE = "of the recorded pose; default: the value for fluoroscopy or for skin markers"
+_OF_POSE = "recorded coordinate; default: the value for fluoroscopy or for skin markers"
 _GIVE = "; 0 by default: give the value of your laboratory"
 _TISSUE = (
     "; default: an assumption, for a Monte Carlo study of the kind of Smith et al. (PMC4755512)"
@@ -85,7 +85,7 @@ SKIN_MARKER_ERROR = SkinMarkerErrorSettings()
 
 
 class CorrelationTable(SceneTable):
-    """Two inputs of [uncertainty] that err together."""
+    """Two inputs of [uncertainty] with correlated errors."""
 
     between: tuple[str, str] = Field(
         description="names of two inputs as tornado.csv has them, e.g. ['ap', 'flexion'] or "
@@ -104,11 +104,10 @@ class CorrelationTable(SceneTable):
 
 
 class UncertaintyTable(SceneTable):
-    """By how much the inputs err, for `tkamb uncertainty`; each key is a standard deviation.
+    """Errors of the inputs, for `tkamb uncertainty`. Each key is a standard deviation.
 
-    A pose error is one offset per sample plus noise per frame; all other errors are one draw per
-    sample. Inputs are independent of each other but for those that [[uncertainty.correlation]]
-    names.
+    A pose error is one offset per sample plus noise per frame. Every other error is one draw per
+    sample. Errors are independent, except those in [[uncertainty.correlation]].
     """
 
     seed: Count = Field(
@@ -122,84 +121,84 @@ class UncertaintyTable(SceneTable):
     flexion_deg: Angle | None = Field(None, description=_OF_POSE)
     constant_share: Annotated[Number, Field(ge=0, le=1)] = Field(
         0.5,
-        description="share of a pose error's variance that is the same in all frames; the rest "
-        "is noise per frame. An assumption, without a source",
+        description="share of a pose error's variance in the offset; the rest is noise per frame. "
+        "An assumption, without a source",
     )
     correlation_s: Annotated[Number, Field(ge=0, le=100)] = Field(
         0.1,
-        description="correlation time of the noise per frame: AR(1) with exp(-dt/correlation_s); 0 "
-        "is white noise. An assumption, without a source",
+        description="correlation time of the noise per frame: AR(1) with exp(-dt/correlation_s); "
+        "0: white noise. An assumption, without a source",
     )
     markers_mm: Length | None = Field(
         None,
-        description="of each marker of [motion.markers] on shank and thigh, each direction by "
-        "itself, the same in all frames; default: 10 mm on the thigh, 6 mm on the shank, an "
-        "assumption after PMC8631460",
+        description="each marker of [motion.markers] on shank and thigh, in each direction, the "
+        "same in all frames; default: 10 mm on the thigh, 6 mm on the shank, an assumption after "
+        "PMC8631460",
     )
     knee_centre_mm: Length = Field(
         3.0,
-        description="AP, SI and ML each: the shank, and the knee with it, against the ground "
+        description="AP, SI and ML each: position of shank and knee relative to the ground "
         "reaction, in the tibia's axes" + _ASSUMED,
     )
     ground_reaction: Share = Field(0.02, description="relative, force and free moment" + _ASSUMED)
     centre_of_pressure_ap_mm: Length = Field(
         3.0,
-        description="laboratory x; default: Exell et al. 2012 (PMID 23259242), 3 ± 2 mm for a "
-        "wheel that rolled from one force plate to the next, against markers",
+        description="along laboratory x; default: Exell et al. 2012 (PMID 23259242), 3 ± 2 mm for "
+        "a wheel that rolled from one force plate to the next, compared with markers",
     )
-    centre_of_pressure_ml_mm: Length = Field(3.0, description="laboratory z; likewise")
-    segment_mass: Share = Field(0.1, description="relative, all segments together" + _ASSUMED)
+    centre_of_pressure_ml_mm: Length = Field(
+        3.0, description="along laboratory z; default: as for centre_of_pressure_ap_mm"
+    )
+    segment_mass: Share = Field(0.1, description="relative, one factor for all segments" + _ASSUMED)
     muscle_strength: Share = Field(
         0.2,
-        description="relative, of the muscles of [muscles]: each group of muscles by itself"
-        + _ASSUMED,
+        description="relative, one factor per group of muscles of [muscles]" + _ASSUMED,
     )
     muscle_attachment_mm: Length = Field(
         3.0,
         description="AP, SI and ML each: both ends of the lines that pull the patella, and the "
-        "points where muscles of [muscles] that cross the knee leave shank and thigh; each group "
-        "of muscles by itself" + _ASSUMED,
+        "points where muscles of [muscles] that cross the knee leave shank and thigh; one error "
+        "per group of muscles" + _ASSUMED,
     )
     tendon_band_mm: Length = Field(
         3.0,
-        description="of band_mm, the width of a wrapped tendon; each tendon by itself; a sample's "
-        "width is never negative. An assumption, without a source: widths of 5 to 15 mm are all "
-        "defensible, and change the quadriceps by up to 9 % in deep flexion",
+        description="band_mm of each wrapped tendon, never negative in a sample. An assumption, "
+        "without a source: 5 to 15 mm are all defensible, and change the quadriceps force by up to "
+        "9 % in deep flexion",
     )
-    ligament_stiffness: Share = Field(0.3, description="relative, each bundle by itself" + _TISSUE)
+    ligament_stiffness: Share = Field(0.3, description="relative, one factor per bundle" + _TISSUE)
     ligament_strain: Annotated[Number, Field(ge=0, le=0.1)] = Field(
         0.02,
-        description="of each bundle by itself: added to its reference strain, or by which its "
-        "slack length is divided: L0/(1 + e)" + _TISSUE,
+        description="strain e of each bundle: added to its reference strain, or its slack length "
+        "L0 becomes L0/(1 + e)" + _TISSUE,
     )
     friction: Annotated[Number, Field(ge=0, le=0.5)] = Field(
         0.017,
-        description="of the coefficient, which stays at or above 0; default: as wide as a "
+        description="coefficient of friction, never negative in a sample; default: as wide as a "
         "uniform distribution over 0.039 to 0.099, measured for CoCr on UHMWPE at 3 to 9 MPa "
         "(doi:10.1155/2015/185142, table 5)",
     )
     young_modulus: Share = Field(
         0.0,
-        description="relative, of the insert; 0 by default, because otherwise each sample has to "
+        description="relative, of the insert; 0 by default, because each sample would have to "
         "prepare its contact again, and the modulus hardly changes the forces",
     )
     yield_stress: Share = Field(
         0.0,
-        description="relative, of the yield stress above which area counts as overloaded; 0: the "
-        "limit does not vary",
+        description="relative, of the yield stress above which area counts as overloaded",
     )
     wear_factor: Share = Field(
         0.44,
-        description="relative, of the wear factor, for `tkamb wear` alone; default: 5 to 95 % are "
-        "a factor of two either way of the median. An assumption: laboratories differ by more",
+        description="relative, for `tkamb wear` alone; default: the 5th and 95th percentiles are "
+        "half and twice the median. An assumption: laboratories differ by more",
     )
     creep: Share = Field(
         0.0, description="relative, of both constants of creep, for `tkamb wear` alone" + _GIVE
     )
     femoral_placement_mm: Length = Field(
         1.0,
-        description="AP, SI and ML each: the femur's ligament and muscle attachments against the "
-        "femoral component" + _ASSUMED,
+        description="AP, SI and ML each: ligament and muscle attachments on the femur, relative to "
+        "the femoral component" + _ASSUMED,
     )
     insert_placement_mm: Length = Field(
         1.0, description="AP, SI and ML each: the insert on the tibia" + _ASSUMED
@@ -215,7 +214,7 @@ class UncertaintyTable(SceneTable):
         description="AP and SI each: position of a recorded patella on the femur" + _ASSUMED,
     )
     correlation: tuple[CorrelationTable, ...] = Field(
-        (), description="inputs that err together; needs a positive semi-definite matrix"
+        (), description="correlated inputs; their matrix must be positive semi-definite"
     )
 
     def completed(self, from_markers: bool) -> Self:
@@ -226,9 +225,9 @@ class UncertaintyTable(SceneTable):
                 are of fluoroscopy.
         """
         defaults = asdict(SKIN_MARKER_ERROR if from_markers else FLUOROSCOPY_ERROR)
-        own = {
+        missing = {
             name: value
             for name, value in defaults.items()
             if name in type(self).model_fields and getattr(self, name) is None
         }
-        return self.model_copy(update=own)
+        return self.model_copy(update=missing)

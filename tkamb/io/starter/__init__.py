@@ -33,15 +33,15 @@ def lay_out(directory: Path, person: "Person | None" = None) -> Path:
         directory.parent.mkdir(parents=True, exist_ok=True)
         with (
             as_file(files("tkamb.io.starter") / "files") as source,
-            tempfile.TemporaryDirectory(dir=directory.parent, prefix=".tkamb-new-") as beside,
+            tempfile.TemporaryDirectory(dir=directory.parent, prefix=".tkamb-new-") as scratch,
         ):
-            whole = Path(beside) / directory.name
-            shutil.copytree(source, whole)
+            copy = Path(scratch) / directory.name
+            shutil.copytree(source, copy)
             if person is not None:
                 from tkamb.io.starter.person import write_person
 
-                write_person(whole, person)
-            whole.replace(directory)  # an empty folder of that name is replaced too
+                write_person(copy, person)
+            copy.replace(directory)  # This also replaces an empty folder of that name.
     except OSError as error:
         raise InputError(f"cannot be written ({error.strerror})", directory) from None
     return directory / "scene.toml"
@@ -71,15 +71,15 @@ def _new(options: argparse.Namespace) -> int:
 
 def _person(options: argparse.Namespace) -> "Person | None":
     """Return the patient that the options describe, or None for the default patient."""
-    given = {
+    values = {
         "side": options.side,
         "mass": options.mass_kg,
         "height": None if options.height_mm is None else options.height_mm * 1e-3,
         "sex": options.sex,
     }
-    given = {key: value for key, value in given.items() if value is not None}
-    if not given:
+    values = {key: value for key, value in values.items() if value is not None}
+    if not values:
         return None
     from tkamb.io.starter.person import Person
 
-    return Person(**given)
+    return Person(**values)

@@ -159,7 +159,7 @@ def patient_urdf(text: str, person: Person) -> str:
 
 def scene_text(text: str, person: Person) -> str:
     """Return the starter's scene with a person's mass, height, sex, side and attachments."""
-    usual = Person()
+    default_person = Person()
     for key, value in {
         "side": f'"{person.side}"',
         "mass_kg": f"{person.mass:g}",
@@ -169,8 +169,8 @@ def scene_text(text: str, person: Person) -> str:
         text = re.sub(rf"(?m)^{key} = [^\s#]+", f"{key} = {value}", text)
     ankle = LEG_PROPORTIONS.ankle * person.height * 1e3
     text = re.sub(r"(?m)^ankle_mm = \[.*?\]", f"ankle_mm = [0.0, {ankle:.2f}, 0.0]", text)
-    knee_up = (person.knee_height - usual.knee_height) * 1e3
-    thigh = person.hip_height / usual.hip_height
+    knee_up = (person.knee_height - default_person.knee_height) * 1e3
+    thigh = person.hip_height / default_person.hip_height
     mirror = -1.0 if person.side == "left" else 1.0
 
     def point(match: re.Match[str]) -> str:

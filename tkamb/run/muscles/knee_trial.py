@@ -35,11 +35,11 @@ class KneeTrial:
 
     Args:
         problems: problems of all frames. Their row of the knee's flexion is not used.
-        flexion: index of that row among the coordinates.
+        flexion: index of the knee's flexion among the coordinates.
         extensor: mask of the muscles of the extensor group, (m,).
         crossing: indices of the other muscles that cross the knee, (c,).
         shank: points where the crossing muscles leave shank or foot, tibia link, m, (f, c, 3).
-        thigh: points where they reach thigh or pelvis, femur link, m, (f, c, 3).
+        thigh: points where these muscles reach thigh or pelvis, femur link, m, (f, c, 3).
         groups: name of a group -> names of its muscles, see `muscle_groups`.
         knee: pose of the femur link in the tibia link for which the points were computed,
             (f, 4, 4); None: unknown.
@@ -89,10 +89,10 @@ class KneeTrial:
     ) -> tuple[FrameProblems, tuple[Array, Array, float, str]]:
         """Return the problem of frame k with the knee's row, and its solution.
 
-        The solution is that of `FrameProblems.solved`.
+        The solution has the form of `FrameProblems.solved`.
 
         Args:
-            k: frame.
+            k: index of the frame.
             moment: moment of muscles and reserve at the knee, N·m.
             extensor_arm: moment arm of the extensor group, m.
             arms: moment arms of the crossing muscles, m, (c,).
@@ -133,7 +133,7 @@ def knee_trial(
         sharing: options.
 
     Raises:
-        InputError: no muscle ends on or passes the patella, or a cause of `solve_trial`.
+        InputError: no muscle ends on or passes the patella, or any error of `solve_trial`.
     """
     leg = links.leg
     problems, bones = trial_problems(leg, motion, loads, sharing)

@@ -194,7 +194,7 @@ def length_twins(model: OpenSimModel) -> dict[str, str]:
 
     A twin is a copy of a muscle with the same strength, fibre length, tendon length and first
     point, but fewer path points. Models contain twins for muscles with a path past the patella to
-    the tibia. The twin's path has the length of muscle and tendon. It must not pull in addition.
+    the tibia. The twin's path has the length of muscle and tendon. The twin itself must not pull.
     """
     pairs = [p for p in combinations(model.muscles.values(), 2) if _same_muscle(*p)]
     ordered = [sorted(pair, key=lambda muscle: len(muscle.path.points)) for pair in pairs]

@@ -90,7 +90,7 @@ class FrameMuscles:
 
     Args:
         trial: optimisation problems and muscle lines of all frames.
-        k: frame.
+        k: index of the frame.
         lines: muscle lines across the knee in this frame.
     """
 

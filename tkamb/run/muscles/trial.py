@@ -11,8 +11,8 @@ Activations a and reserves minimise, with the options of `Sharing`,
 
     Σ_i w_i a_i^p + Σ_c (r_c / ρ_c)²,   lowest <= a_i <= highest.
 
-By the chain rule, a dependent coordinate contributes to τ and R of the coordinate on which its
-coupler makes it depend.
+By the chain rule, a dependent coordinate contributes to τ and R of its coupler's independent
+coordinate.
 
 A taut muscle line is a chain of straight parts between points on bones and on their wrap objects.
 A part from bone A at p to bone B at q pulls A at p along u = (q - p)/|q - p|, and B at q along -u.
@@ -101,7 +101,7 @@ class Bones:
     def attachments(self, bone: str, towards: str | None) -> Attachments:
         """Return the effective attachments of muscles on a bone, for pulls towards another bone.
 
-        For a muscle with several straight parts between the bones it is the last one. `pull_on`
+        If a muscle has several straight parts between the bones, the last one counts. `pull_on`
         sums over all parts.
 
         Args:

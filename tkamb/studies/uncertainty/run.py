@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import h5py
 import numpy as np
@@ -53,9 +53,6 @@ from tkamb.studies.uncertainty.sampling import (
     normal_samples,
 )
 from tkamb.studies.uncertainty.sensitivity import SobolIndex, sobol_indices
-
-if TYPE_CHECKING:
-    from tkamb.studies.uncertainty.sensitivity import SobolIndex
 
 
 def write_uncertainty(uncertainty: "Uncertainty", folder: Path) -> None:
@@ -211,8 +208,9 @@ def estimate_uncertainty(
     crew = PoolOptions(workers, dask)
     if not STATISTICS_LIMITS.min_samples <= samples <= MOST_SAMPLES:
         raise InputError(
-            f"{samples} is not within {STATISTICS_LIMITS.min_samples} to {MOST_SAMPLES}",
+            f"cannot be {samples}",
             "samples",
+            f"give a number from {STATISTICS_LIMITS.min_samples} to {MOST_SAMPLES}",
         )
     if directory is None and resume:
         raise InputError("needs the folder of the earlier run", "resume", "give a directory")

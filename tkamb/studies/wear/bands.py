@@ -354,9 +354,9 @@ def check_samples(samples: int) -> None:
         InputError: the number is out of range.
     """
     if samples and not STATISTICS_LIMITS.min_samples <= samples <= WEAR_BAND.max_samples:
-        hint = "or give 0 for no bands"
         raise InputError(
-            f"{samples} is not within {STATISTICS_LIMITS.min_samples} to {WEAR_BAND.max_samples}",
+            f"cannot be {samples}",
             "--samples",
-            hint,
+            f"give a number from {STATISTICS_LIMITS.min_samples} to {WEAR_BAND.max_samples}, or 0 "
+            "for no bands",
         )

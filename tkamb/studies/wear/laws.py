@@ -201,7 +201,8 @@ class ContactArea(WearLaw):
 
     def __post_init__(self) -> None:
         _check_cross_shears(self.cross_shear)
-        if len(check_factors(self.coefficient, "coefficient")) != len(self.cross_shear):
+        coefficients = check_factors(self.coefficient, "coefficient", "m per m")
+        if len(coefficients) != len(self.cross_shear):
             raise InputError("has another length than cross_shear", "coefficient")
 
     def depth(self, history: SlidingHistory) -> Array:
@@ -209,24 +210,24 @@ class ContactArea(WearLaw):
         return np.interp(history.cross_shear, self.cross_shear, self.coefficient) * history.distance
 
 
-def check_factor(value: Any, where: str) -> float:
-    """Return a wear factor or coefficient after a check.
+def check_factor(value: Any, where: str, unit: str = "mm³/(N m)") -> float:
+    """Return a wear factor or coefficient after a check; `unit` is named in the message.
 
     Raises:
         InputError: the value is negative, not finite, or above `WEAR_LAW.max_wear_factor`.
     """
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if not (number and math.isfinite(value) and 0 <= value <= WEAR_LAW.max_wear_factor):
-        hint = f"give a number from 0 to {WEAR_LAW.max_wear_factor:g} in mm³/(N m)"
+        hint = f"give a number from 0 to {WEAR_LAW.max_wear_factor:g} in {unit}"
         raise InputError(f"cannot be {value}", where, hint)
     return float(value)
 
 
-def check_factors(values: Any, where: str) -> list[float]:
+def check_factors(values: Any, where: str, unit: str = "mm³/(N m)") -> list[float]:
     """Return a list of wear factors after a check; see `check_factor`."""
     if not isinstance(values, tuple | list):
         raise InputError(f"cannot be {values}", where, "give a list of numbers")
-    return [check_factor(value, where) for value in values]
+    return [check_factor(value, where, unit) for value in values]
 
 
 def _rows(law: PressureCrossShear) -> Any:

@@ -207,7 +207,7 @@ class MachineJoint:
     gap: Array
     zero: Array
 
-    def imbalance(self, coordinates: Array, contact: Array) -> Array:
+    def residual(self, coordinates: Array, contact: Array) -> Array:
         """Return the residuals r (..., n) at coordinates (..., 6) with contact wrench (6,)."""
         offset = coordinates - self.zero
         spring = self.stiffness * np.sign(offset) * np.maximum(np.abs(offset) - self.gap, 0.0)

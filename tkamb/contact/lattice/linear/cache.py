@@ -14,8 +14,9 @@ A file is used only if
 - it is a regular file of this user, and nobody else may write it;
 - size, sums and key are right;
 - its operator inverts the stiffness of the solid (`operator_error`).
-Otherwise the operator is computed again, with one notice. When the folder exceeds its limit, the
-least recently used files are removed, and half-written files of killed processes too.
+Otherwise the operator is computed again, with one notice. After a file is written, half-written
+files of killed processes are removed. If the folder then exceeds its limit, the least recently used
+files are removed too.
 
 The folder is $TKAMB_CACHE_DIR, else $XDG_CACHE_HOME/tkamb, else ~/.cache/tkamb. Small operators,
 which take about a second, are not stored.
@@ -164,7 +165,7 @@ def check_operator(
     """Check that a stored operator belongs to the solid.
 
     The mapped memory is released after the check, because a motion reads only a small part of the
-    response. The system's file cache has the pages that are read again.
+    response. Pages that are read again come from the system's file cache.
 
     Args:
         operator: the stored operator.
@@ -174,7 +175,7 @@ def check_operator(
         contact_nodes: nodes of the contact surface, shape (c,).
 
     Raises:
-        DamagedOperator: it has other unknowns, or does not invert the solid's stiffness.
+        DamagedOperator: the operator has other unknowns, or does not invert the stiffness.
     """
     same_unknowns = np.array_equal(operator.free, ~fixed)
     if not same_unknowns or not np.array_equal(operator.contact_nodes, contact_nodes):
@@ -324,7 +325,7 @@ def _padding(length: int) -> int:
 
 
 def _operator_of(arrays: list[NDArray[Any]]) -> ElasticOperator:
-    """Return the operator of the arrays of `_parts`.
+    """Return the operator from its arrays, in the order of `_parts`.
 
     Compiled code does not check bounds, so every index is checked here.
     """
@@ -342,7 +343,7 @@ def _operator_of(arrays: list[NDArray[Any]]) -> ElasticOperator:
         len(factor.scale) != unknowns + len(factor.boundary)
         or len(factor.values) != factor.firsts[-1]
     ):
-        raise ValueError("the rows of the factor have another number or length")
+        raise ValueError("the factor has a wrong number or length of rows")
     if factor.parents.size and not (factor.parents > np.arange(fronts))[factor.parents >= 0].all():
         raise ValueError("a front is not below its parent")
     half = HalfResponse.of(rank, blocks, columns)
@@ -351,7 +352,7 @@ def _operator_of(arrays: list[NDArray[Any]]) -> ElasticOperator:
         _check(np.diff(edges), 0, count + 1)
     _check(rank, -1, half.columns)
     if len(columns) != (np.diff(blocks[:, :2]) * np.diff(blocks[:, 2:])).sum():
-        raise ValueError("the columns of the response have another number or length")
+        raise ValueError("the response has a wrong number or length of columns")
     return ElasticOperator(free, factor, contact_nodes, half)
 
 
@@ -379,7 +380,7 @@ def prune(folder: Path, limit: float) -> None:
 
 
 def _remove_orphans(folder: Path) -> int:
-    """Remove half-written files of killed processes; return the bytes of those still written."""
+    """Remove half-written files of killed processes; return the bytes of young or locked ones."""
     remaining = removed = freed = 0
     # Release 0.1.0 wrote tmp*.part.
     for path in [*folder.glob(".tkamb-*.part"), *folder.glob("tmp*.part")]:

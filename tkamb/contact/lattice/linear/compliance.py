@@ -30,7 +30,7 @@ SINGLE: Precision = np.float32
 
 @dataclass(frozen=True)
 class ResponseSettings:
-    """Products of the factor with columns of forces."""
+    """Products of columns of Z, for the compliance."""
 
     gathered_columns: int = 512
     """Columns that are copied for BLAS at a time. Chosen because their 3 MB fit into a processor's
@@ -48,7 +48,7 @@ class HalfResponse:
     """Z = L⁻¹ E of q unknowns.
 
     Args:
-        rank: column of Z of each of the caller's unknowns, shape (q,); -1 if it is held.
+        rank: column of Z of each unknown, shape (q,); -1 if the unknown is held.
         blocks: nonzero blocks of Z, shape (b, 4): first row, end of the rows, first column, end
             of the columns. An end is one past the last. Rows are in elimination order, and no two
             blocks share a row.
@@ -293,7 +293,7 @@ class HalfSolves:
         self._columns: list[NDArray[Any]] = []
 
     def add(self, member: int, front: Front) -> None:
-        """Add the columns of the next front, from its numbers before they are rounded."""
+        """Add the columns of the next front, from its block before rounding."""
         first, last = self._spans[member]
         if last == first:
             return

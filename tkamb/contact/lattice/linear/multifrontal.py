@@ -31,7 +31,7 @@ from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.threads import both
 
 CUTS = 16
-"""Number of divisions of the fronts between two threads that are compared."""
+"""Number of trial divisions of the fronts between two threads."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,7 +307,8 @@ def _forward(
 ) -> None:
     """Apply the fronts' steps of L⁻¹ x.
 
-    A step subtracts L21 L11⁻¹ x₁ from the boundary, and replaces its own unknowns x₁ by L11⁻¹ x₁.
+    A step subtracts L21 L11⁻¹ x₁ from the boundary, and replaces the front's own unknowns x₁ by
+    L11⁻¹ x₁.
     """
     dtype = scale.dtype.type
     for front in fronts:
@@ -342,7 +343,7 @@ def _backward(
 ) -> None:
     """Apply the fronts' steps of L⁻ᵀ x, the last front first.
 
-    A step replaces its own unknowns x₁ by Wᵀ [x₁; -x₂], with the unknowns x₂ of the boundary.
+    A step replaces the front's own unknowns x₁ by Wᵀ [x₁; -x₂]. x₂ are those of the boundary.
     """
     dtype = scale.dtype.type
     for front in fronts[::-1]:
@@ -464,7 +465,7 @@ def fronts_of(
 def _lower_columns(matrix: sparse.csr_matrix, rank: Index, count: int) -> sparse.csc_matrix:
     """Return the lower half of a symmetric matrix (n, n) in elimination order, by columns.
 
-    The rows of a column are not sorted. `rank` is that of `fronts_of`, and `count` the number of
+    The rows of a column are not sorted. `fronts_of` explains `rank`. `count` is the number of
     unknowns with a rank.
     """
     edges = np.zeros(count + 1, np.int64)

@@ -40,7 +40,8 @@ class MemoryNeedSettings:
     unknowns_per_node: int = 3
     """Unknowns of a node. By definition; held unknowns are counted too."""
     cell_bytes: int = 20_000
-    """Bytes for a cell during the assembly of the stiffness. Measured: 9 to 22 kB."""
+    """Bytes for a cell during the assembly of the stiffness. Measured: 9 to 22 kB, which
+    `safety_factor` covers."""
     entry_bytes: int = 36
     """Bytes for an entry of the stiffness matrix: 20 for the entry and its copy in elimination
     order, 16 for the arrays of the compliance. Measured: without these 16 the estimate is 12 %
@@ -52,7 +53,7 @@ class MemoryNeedSettings:
     cell_size_step: float = 0.05e-3
     """m: proposed cell sizes are multiples of it. Chosen because it gives round numbers."""
     largest_cell_size: float = 5e-3
-    """m: largest cell size that is proposed. Chosen because a condyle's contact would be two cells
+    """m: largest cell size that is proposed. Chosen because a condyle's contact is then two cells
     wide."""
 
 
@@ -82,7 +83,7 @@ class TooLittleMemoryError(ComputationError):
         if least_size > MEMORY_NEED.largest_cell_size:
             return "free some memory"
         step = MEMORY_NEED.cell_size_step
-        # Rounded up, so that the proposed size fits; with 1e-9, a multiple of the step stays.
+        # Rounded up, so that the proposed size fits. An exact multiple stays, because of the 1e-9.
         proposal = np.ceil(least_size / step * (1.0 - 1e-9)) * step
         return f"take {proposal / MILLIMETRE:g} mm or coarser"
 
@@ -125,7 +126,7 @@ def factor_memory(
         tree: dissection of n nodes.
         joined: pattern of the joined nodes, shape (n, n).
         touched: mask of the contact nodes, shape (n,).
-        itemsize: bytes of a stored number; the factor is computed with 8.
+        itemsize: bytes of a stored number. A computed number has 8 bytes.
     """
     rank = np.empty(joined.shape[0], np.int64)
     rank[np.concatenate(tree.own)] = np.arange(len(rank))
@@ -283,7 +284,7 @@ def fixed_unknowns(
         bearing: "fixed" or "mobile".
         piece: number of each node's piece, shape (n,); None: there is one piece.
         ends_held: whether x and z of both end nodes are held, as in Sharma (2008), section 4.5.4.
-            Then the insert cannot widen, and a uniform pressure is uneven by up to 10 %.
+            Then the insert cannot widen. A pressure that should be uniform varies by up to 10 %.
     """
     fixed = np.zeros((len(nodes), 3), bool)
     if bearing == "fixed":

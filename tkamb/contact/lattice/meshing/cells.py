@@ -195,7 +195,7 @@ def mean_gradient(corners: Array) -> tuple[Array, Array]:
 
     A linear field has its exact gradient: sum_i x_i g_i = identity (Flanagan & Belytschko,
     Int J Numer Meth Eng 17:679, 1981). The cofactors of the Jacobian replace its inverse, so that
-    inverted cells are no exception.
+    inverted cells cause no error.
     """
     gradients, volume = np.zeros((len(corners), 8, 3)), np.zeros(len(corners))
     j, cofactor = np.empty((3, 3)), np.empty((3, 3))

@@ -102,8 +102,8 @@ def _reference_layers(top: Array, thinnest: float, thickest: float, spacing: flo
     """Return the number of layers that can follow the largest part of the top surface.
 
     The layers end in a step where the top is more than half a layer too low for them. The edge of
-    a step has cells on one side only, and is therefore too soft. Numbers of layers with such steps
-    in the dishes are excluded. Steps on higher parts are allowed, because no condyle meets them.
+    a step has cells on one side only, and is therefore too soft. A number of layers that causes
+    steps in the dishes is excluded. Steps on higher parts are allowed: no condyle meets them.
     """
     candidates = np.arange(1, int(np.ceil(top.max() / thinnest)) + 1)
     stepped = np.array([np.mean(top < (n - 0.5) * thinnest) for n in candidates])
@@ -191,13 +191,13 @@ class ColumnSettings:
     meshes."""
     wall_normal_y: float = 0.05
     """1: a triangle with a smaller y of its normal (87 deg) belongs to a wall. Chosen because no
-    articular surface is as steep."""
+    articular surface is that steep."""
     wall_inset: float = 0.02
     """Cells: distance inside a wall at which a missed vertical ray is repeated. Chosen because a
     ray exactly on a rough wall may miss the part."""
     max_height_change: float = 0.75
     """Cells: largest change of a surface's height when a node moves sideways. If it is larger, the
-    ray has hit another surface. Chosen because slopes that cells can follow change by less."""
+    ray has hit another surface. Chosen because slopes that cells follow cause smaller changes."""
 
 
 COLUMN = ColumnSettings()
@@ -242,7 +242,7 @@ class NodeField:
 class Ends:
     """The layers of the first and last nodes of intervals.
 
-    `single` marks intervals of one node. `held` marks those of them whose node is not moved.
+    `single` marks intervals of one node. `held` marks intervals whose only node is not moved.
     """
 
     first: Index
@@ -383,8 +383,8 @@ def refired_inwards(
 ) -> Array:
     """Return the heights (n,), m, of nodes that are moved onto walls.
 
-    Walls of a mesh are rough, so that a vertical ray on a wall may miss the part. The ray is then
-    repeated inside by `wall_inset`, and the target moved there.
+    Walls of a mesh are rough, so that a vertical ray on a wall may miss the part. The target is
+    then moved inside by `wall_inset`, and the ray repeated.
 
     Args:
         field: all nodes of the grid.

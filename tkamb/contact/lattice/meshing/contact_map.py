@@ -71,8 +71,8 @@ def contact_map(lattice: Lattice, insert: Surface) -> tuple[Index, ContactMap]:
 def contact_squares(triangles: Index) -> Index:
     """Return the cell faces (k/2, 4) of the contact triangles (k, 3) of a `Lattice`.
 
-    The first half of the triangles are the first halves of the faces, the second half are the
-    second halves in the same order. Both share the face's first and third corner.
+    Triangles i and i + k/2 are the two halves of face i. They share the face's first and third
+    corner.
     """
     first, second = np.split(triangles, 2)
     if not np.array_equal(first[:, [0, 2]], second[:, [0, 1]]):

@@ -65,7 +65,8 @@ def connected_pieces(cells: Index) -> Index:
 def standing_pieces(cells: Index, bottom: Mask) -> Mask:
     """Return the mask (c,) of the cells of large pieces that stand on the bottom.
 
-    A piece that does not stand on the bottom has no fixed node, and its stiffness is singular.
+    A piece that does not stand on the bottom has no fixed node, and its stiffness is singular. If
+    no piece stands on the bottom, the largest one is kept.
 
     Args:
         cells: nodes of the cells, shape (c, 8).
@@ -140,11 +141,11 @@ def outer_skin(nodes: Array, cells: Index) -> Surface:
 
 
 def solid_volume(insert: Surface, centres: Array) -> float:
-    """Return the volume of the mesh's bodies, m³. Where two bodies overlap, it counts once.
+    """Return the volume of the mesh's bodies, m³. Where bodies overlap, it counts once.
 
     Args:
         insert: closed mesh.
-        centres: points in all its bodies, m, shape (c, 3), a few per cubic millimetre.
+        centres: points throughout its bodies, m, shape (c, 3), a few per cubic millimetre.
     """
     if not (insert.winding.at(centres) > 1).any():
         return insert.volume
@@ -250,7 +251,7 @@ class Lattice:
             (self.closed_gaps, "{} gaps narrower than a cell filled"),
             (self.thin_intervals, "{} intervals thinner than half a cell held by one node"),
             (self.dropped_cells, "{} cells left out: flat, inverted, across a gap, or loose"),
-            (self.dropped_nodes, "{} nodes left out that no cell holds"),
+            (self.dropped_nodes, "{} nodes left out: in no cell"),
         )
         counted = (phrase.format(count) for count, phrase in counts if count)
         return (*self.size_notices, *counted)
@@ -318,7 +319,8 @@ def make_grid(insert: Surface, target_size: float) -> Lattice:
         raise InputError(
             f"{count:.2g} cells of {target_size / MILLIMETRE:g} mm are too many",
             insert.name,
-            f"take larger cells ({GRID.max_cells:.0e} at most), and check the mesh's unit",
+            f"give a larger resolution (at most {GRID.max_cells:.0e} cells), and check the unit "
+            "of the mesh",
         )
     field = place_columns(insert, spacing)
     move_to_walls(field, insert)
@@ -335,12 +337,12 @@ def make_grid(insert: Surface, target_size: float) -> Lattice:
 def grid_spacing(extent: Array, target_size: float) -> Array:
     """Return the edges (3,), m, of cells that divide a box (3,) evenly.
 
-    They are near to the target size. If their ratio would exceed `GRID.max_edge_ratio`, the size
-    nearest to the target that gives a smaller ratio is used.
+    The edges are near to the target size. If their ratio would exceed `GRID.max_edge_ratio`, the
+    nearest size with a smaller ratio is used.
     """
     if target_size <= 0.0:
         raise InputError(
-            f"a cell size of {target_size / MILLIMETRE:g} mm", hint="give a positive size"
+            f"the cell size is {target_size / MILLIMETRE:g} mm", hint="give a positive size"
         )
     # Smaller and larger sizes are tried until the cells are nearly cubic.
     for percent in range(400):
@@ -354,7 +356,7 @@ def grid_spacing(extent: Array, target_size: float) -> Array:
 
 
 def _sound_cells(field: NodeField, insert: Surface) -> tuple[Index, int]:
-    """Return the usable cells (c, 8), as flat grid numbers, and the number of omitted cells."""
+    """Return the usable cells (c, 8) of the flattened grid, and the number of omitted cells."""
     shape = field.member.shape
     corner = np.argwhere(_all_corners(field.member))
     grid = corner[:, None, :] + CORNERS
@@ -407,7 +409,7 @@ def _assemble(field: NodeField, cells: Index, dropped_cells: int) -> Lattice:
 
 
 def _classes(field: NodeField, cells: Index) -> NDArray[np.int8]:
-    """Return the class of every grid node (flat). Inner nodes belong to 8 cells."""
+    """Return the class of every node of the flattened grid. Inner nodes belong to 8 cells."""
     on_surface = np.bincount(cells.ravel(), minlength=field.member.size) < 8
     result = np.where(on_surface, OTHER, INTERNAL).astype(np.int8)
     result[field.top.ravel()] = CONTACT
@@ -416,7 +418,7 @@ def _classes(field: NodeField, cells: Index) -> NDArray[np.int8]:
 
 
 def _on_bottom(field: NodeField) -> Mask:
-    """Return the mask of grid nodes (flat) in the flat bottom."""
+    """Return the mask, over the flattened grid, of nodes in the flat bottom."""
     height = field.points[..., 1].ravel()
     flat = np.abs(height) <= max(GRID.bottom_tolerance, 0.02 * field.spacing[1])
     return field.lower_end.ravel() & flat

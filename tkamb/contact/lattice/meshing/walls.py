@@ -260,8 +260,8 @@ def _move_out(field: NodeField, firing: Array, hits: list[WallHits], rays: RayCa
         is_ahead = ahead <= behind + tie
         step = np.where(is_ahead, ahead, -behind)
         move[..., column] = np.where(near & (np.abs(step) > tie), step, 0.0)
-        # These walls have their node. In a thin part, the wall on the other side still needs the
-        # node outside.
+        # These walls now have a node. In a thin part, the opposite wall still needs the node
+        # outside.
         forward.distance[near & is_ahead] = np.inf
         backward.distance[near & ~is_ahead] = np.inf
     nodes: Nodes = np.nonzero((move != 0.0).any(axis=-1))
