@@ -1,4 +1,4 @@
-"""Free-body balance of one leg: shank and foot, patella, thigh. numpy alone, nothing of tkamb."""
+"""Free-body equilibrium of one leg (shank and foot, patella, thigh), without tkamb."""
 
 from dataclasses import dataclass, field
 
@@ -8,23 +8,24 @@ from raw_leg import STEP
 
 FRICTION = 0.05
 STANDSTILL = 1e-3
-"""m/s; friction has no direction below it and fades, as the product documents."""
+"""Sliding speed below which friction fades, as in tkamb, m/s."""
 
 
 @dataclass
 class Lent:
-    """Geometry taken from the product, insert frame: no load, no mass, no rate.
+    """Geometry computed by tkamb, insert frame, m.
 
     Args:
-        condyles: side -> (point (3,), unit normal (3,) into the femur).
-        unloaded: sides that do not carry.
-        slack: the extensor mechanism does not carry.
-        quadriceps: (link, point (3,), force (3,) per newton of tension), wraps included.
-        patellar_ligament: likewise.
-        patellofemoral: (point (3,), unit normal (3,) into the patella).
-        others: (start (3,) m in the tibia link, end (3,) m in the femur link, N) of further
-            muscles from shank to thigh.
-        reserve: N·m on the shank about insert z.
+        condyles: side -> contact point (3,) and unit normal (3,) into the femur.
+        unloaded: sides that carry no load.
+        slack: whether the extensor mechanism is slack.
+        quadriceps: (link, point (3,), force (3,) per newton of tension) of each load of the
+            quadriceps, also where it wraps.
+        patellar_ligament: the same for the patellar ligament.
+        patellofemoral: contact point (3,) and unit normal (3,) into the patella.
+        others: further muscles from shank to thigh: start (3,) in the tibia link, end (3,) in the
+            femur link, tension, N.
+        reserve: reserve moment on the shank about insert z, N·m.
     """
 
     condyles: dict
@@ -38,11 +39,11 @@ class Lent:
 
 
 class FreeBodies:
-    """The leg at one instant, cut into shank with foot, patella, and thigh.
+    """Free bodies of the leg at one instant: shank with foot, patella, and thigh.
 
     Args:
-        leg: a `raw_leg.Leg`.
-        t: s.
+        leg: leg, a `raw_leg.Leg`.
+        t: time, s.
         lent: geometry of contact and muscle line.
     """
 
@@ -55,12 +56,12 @@ class FreeBodies:
     def loads(self):
         """Return the unknowns by name, N and N·m, insert axes.
 
-        Shank with foot (6): ligament tension, both condyles, residual forces on the tibia
-        along insert x and z at the middle of the condyles' points, residual moment about
-        insert y. A condyle that does not carry is replaced by a moment about insert x, a
-        slack extensor mechanism by one about insert z. Patella (3, in the femur's sagittal
-        plane): quadriceps, patellofemoral force along its normal and across it. Thigh and
-        patella (6): force and moment at the hip, on the femur.
+        Shank with foot (6): tension of the patellar ligament, forces of both condyles, residual
+        forces on the tibia along insert x and z midway between the contact points, residual moment
+        about insert y. An unloaded condyle is replaced by a moment about insert x, a slack
+        extensor mechanism by a moment about insert z. Patella (3, in the femur's sagittal plane):
+        quadriceps, normal and tangential patellofemoral force. Thigh and patella (6): force and
+        moment on the femur at the hip.
         """
         columns = self._on_shank()
         known = self.leg.ground(self.t) + self._ligaments(1) + self._others()
@@ -90,7 +91,7 @@ class FreeBodies:
         return values
 
     def _on_shank(self):
-        """Return name -> wrench (6,) on the shank of one newton (newton metre)."""
+        """Return name of an unknown -> its wrench (6,) on the shank per N or N·m."""
         lent, columns = self.lent, {}
         for side, (point, normal) in lent.condyles.items():
             if side not in lent.unloaded:
@@ -109,7 +110,7 @@ class FreeBodies:
         return columns
 
     def _patella(self, patellar):
-        """Return quadriceps and patellofemoral force by the patella's sagittal balance."""
+        """Return quadriceps and patellofemoral force by the patella's sagittal equilibrium."""
         lent, femur = self.lent, self.leg.in_laboratory("femur", self.t)
         point, normal = lent.patellofemoral
         across = np.cross(femur[:3, 2] @ self.axes, normal)
@@ -120,26 +121,26 @@ class FreeBodies:
         ]
         right = self.leg.needed("patella", self.t)
         right = right - patellar * self._line(lent.patellar_ligament, "patella")
-        # moments about an axis through the patella: about the laboratory's origin they are large
-        here = self.leg.in_laboratory("patella", self.t)[:3, 3]
-        rows = np.array([self._sagittal(w, femur, here) for w in (*columns, right)])
+        # moments about the patella, because moments about the laboratory's origin are large
+        centre = self.leg.in_laboratory("patella", self.t)[:3, 3]
+        rows = np.array([self._sagittal(w, femur, centre) for w in (*columns, right)])
         names = ("muscle_quadriceps", "patellofemoral", "patellofemoral_tangential")
         return dict(zip(names, np.linalg.solve(rows[:3].T, rows[3]), strict=True))
 
     @staticmethod
-    def _sagittal(w, femur, here):
+    def _sagittal(w, femur, centre):
         """Return the forces along the femur's x and y, and the moment about its z (3,)."""
-        moment = w[3:] - np.cross(here, w[:3])
+        moment = w[3:] - np.cross(centre, w[:3])
         return np.array([w[:3] @ femur[:3, 0], w[:3] @ femur[:3, 1], moment @ femur[:3, 2]])
 
     def _slip(self, point, normal):
-        """Return the direction in which the femur slides there, fading below `STANDSTILL`."""
+        """Return the femur's sliding direction at a point; its length fades below `STANDSTILL`."""
         femur, tibia = (
             [self.leg.in_laboratory(link, self.t + d) for d in (-STEP, 0.0, STEP)]
             for link in ("femur", "tibia")
         )
-        here = self._to(point)
-        velocity = carried(femur, here) - carried(tibia, here)
+        contact = self._to(point)
+        velocity = point_velocity(femur, contact) - point_velocity(tibia, contact)
         normal = self._out(normal)
         velocity = velocity - velocity @ normal * normal
         return velocity / np.hypot(np.linalg.norm(velocity), STANDSTILL)
@@ -153,7 +154,7 @@ class FreeBodies:
         return total
 
     def _others(self):
-        """Return the wrench on the shank of muscles whose force is known, and of the reserve."""
+        """Return the wrench of the further muscles and the reserve on the shank."""
         total = np.append(np.zeros(3), self.lent.reserve * self.axes[:, 2])
         for start, end, force in self.lent.others:
             start, end = (
@@ -184,9 +185,9 @@ def wrench(point, force):
     return np.concatenate([force, np.cross(point, force)])
 
 
-def carried(poses, point):
+def point_velocity(poses, point):
     """Return the velocity (3,) of a body's point, by central difference of its poses."""
-    before, here, after = poses
-    own = here[:3, :3].T @ (point - here[:3, 3])
-    places = [pose[:3, :3] @ own + pose[:3, 3] for pose in (before, after)]
+    before, now, after = poses
+    in_body = now[:3, :3].T @ (point - now[:3, 3])
+    places = [pose[:3, :3] @ in_body + pose[:3, 3] for pose in (before, after)]
     return (places[1] - places[0]) / (2 * STEP)

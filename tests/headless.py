@@ -1,4 +1,4 @@
-"""Pages in a headless browser: playwright drives the chromium that is installed."""
+"""Pages in a headless browser: playwright with an installed chromium."""
 
 from contextlib import contextmanager
 from pathlib import Path
@@ -8,13 +8,13 @@ import pytest
 from tkamb.errors import ComputationError
 
 READY = "document.body && document.body.dataset.ready"
-"""Holds on a page of the viewer that is drawn."""
+"""JavaScript expression that is true after the viewer has drawn its page."""
 
 
 @contextmanager
 def chromium():
-    """Give a browser; the test is skipped where there is none."""
-    from tkamb.show.view.page import (  # late: conftest imports this file
+    """Yield a browser. The test is skipped if none is installed."""
+    from tkamb.show.view.page import (  # not at the top, because conftest imports this file
         SOFTWARE_GRAPHICS,
         find_browser,
     )
@@ -35,7 +35,7 @@ class Page:
 
     Attributes:
         problems: console errors, exceptions and failed requests so far.
-        requests: addresses that the page asked for.
+        requests: addresses that the page has requested.
     """
 
     def __init__(self, browser):
@@ -48,36 +48,36 @@ class Page:
         self.evaluate, self.close = self._page.evaluate, self._page.close
 
     def open(self, url, ready=READY):
-        """Open an address and wait until a JavaScript expression holds."""
+        """Open an address and wait until a JavaScript expression is true."""
         self._page.goto(url)
         self.wait(ready)
         return self
 
     def wait(self, ready):
-        """Wait until a JavaScript expression holds."""
+        """Wait until a JavaScript expression is true."""
         self.evaluate(
             "new Promise((done) => { const t = setInterval(() => {"
             f"if ({ready}) {{ clearInterval(t); done(true); }} }}, 20); }})"
         )
 
     def forgive(self, words):
-        """Wait for a console error that holds these words, and forget it."""
+        """Wait for a console error that contains these words, and remove it from `problems`."""
         while not (awaited := [one for one in self.problems if words in one]):
             self._page.wait_for_event("console")
         self.problems.remove(awaited[0])
 
     def saved(self, selector):
-        """Click on something and return the bytes of the file that it saves."""
-        with self._page.expect_download() as found:
+        """Click on an element and return the bytes of the file that the page saves."""
+        with self._page.expect_download() as download:
             self._page.click(selector)
-        return Path(found.value.path()).read_bytes()
+        return Path(download.value.path()).read_bytes()
 
     def press(self, key):
-        """Press a key on what has the focus."""
+        """Press a key. The focused element receives it."""
         self._page.keyboard.press(key)
 
     def pdf(self):
-        """Return the page as it is printed."""
+        """Return the bytes of the page printed as PDF."""
         return self._page.pdf(prefer_css_page_size=True)
 
     def _console(self, message):

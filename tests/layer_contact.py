@@ -15,7 +15,7 @@ from scipy.special import ellipe, ellipk, j0, j1
 
 
 def sphere_on_layer(radius, thickness, load, young, nu, rings=160):
-    """Return contact radius, approach, ring middles and pressures there (SI)."""
+    """Return contact radius, approach, mean radii of the rings, and their pressures (SI)."""
     low, high = 1e-6, 0.5 * thickness + radius * 0.2
     for _ in range(60):
         a = 0.5 * (low + high)
@@ -45,7 +45,7 @@ def _indent(radius, thickness, a, young, nu, rings):
 
 
 def _disks(at, radii, thickness, young, nu):
-    """Return displacement at radii `at` (n,) under unit pressure on disks (m,)."""
+    """Return displacements (n, m) at radii `at` (n,) under unit pressure on disks (m,)."""
     r, b = at[:, None], radii[None]
     m = np.minimum(r / b, b / r) ** 2
     inside = 4 * b / np.pi * ellipe(m)
@@ -59,5 +59,5 @@ def _disks(at, radii, thickness, young, nu):
         2 * kappa * np.cosh(2 * w) + 1 + kappa**2 + 4 * w**2
     ) - 1
     transform = radii[:, None] * j1(k[None] * radii[:, None]) / k
-    rest = j0(k[None] * at[:, None]) @ (layer * weights * 10 / thickness * transform).T
-    return 2 * (1 - nu**2) / young * (half_space + rest)
+    correction = j0(k[None] * at[:, None]) @ (layer * weights * 10 / thickness * transform).T
+    return 2 * (1 - nu**2) / young * (half_space + correction)

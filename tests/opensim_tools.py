@@ -1,4 +1,4 @@
-"""OpenSim's own tools on a trial, in a folder of their own; needs the package `opensim`."""
+"""OpenSim's tools on a trial. The package `opensim` is needed."""
 
 import time
 import xml.etree.ElementTree as ElementTree
@@ -12,19 +12,19 @@ from tkamb.io.recordings.tables import read_table
 from tkamb.show.storage import write_storage
 
 UNBALANCED = 1e4
-"""N or N·m: optimal force of the actuators of coordinates that no muscle balances."""
+"""Optimal force of actuators on coordinates without a reserve, N or N·m."""
 
 
 class Tools:
     """OpenSim on a trial of JW.
 
-    The files hold the filtered coordinates and plates at the frames, so that every tool is told
-    not to filter. Ranges are not clamped: AnalyzeTool poses the model, clamped, to take centres
-    of pressure from ground to the feet, InverseDynamicsTool does not.
+    The input files hold filtered coordinates and ground reactions, so the tools do not filter.
+    Coordinates are not clamped to their ranges, because AnalyzeTool would clamp them and
+    InverseDynamicsTool would not.
 
     Args:
-        trial: the trial.
-        folder: to write to.
+        trial: gait trial.
+        folder: folder for input and output files.
     """
 
     def __init__(self, trial: Gait, folder: Path) -> None:
@@ -78,11 +78,11 @@ class Tools:
         excluded.append("Muscles")
         tool.setExcludedForces(excluded)
         tool.run()
-        found = read_table(self.folder / "id.sto").columns
+        columns = read_table(self.folder / "id.sto").columns
         names = self.trial.kinematics.model.coordinates
         return np.stack(
             [
-                next(found[f"{n}_{e}"] for e in ("moment", "force") if f"{n}_{e}" in found)
+                next(columns[f"{n}_{e}"] for e in ("moment", "force") if f"{n}_{e}" in columns)
                 for n in names
             ],
             axis=1,
@@ -91,12 +91,12 @@ class Tools:
     def write_model(
         self, muscles: tuple[str, ...], reserve: dict[str, float], wraps: bool = True
     ) -> Path:
-        """Write the model with some muscles and a reserve on every coordinate that is free.
+        """Write the model with some muscles and an actuator on every independent coordinate.
 
         Args:
-            muscles: names of those that stay.
-            reserve: coordinate -> optimal force of its actuator, where not `UNBALANCED`.
-            wraps: whether paths keep their wrap objects.
+            muscles: names of the muscles to keep.
+            reserve: coordinate -> optimal force of its actuator. Others have `UNBALANCED`.
+            wraps: whether muscle paths keep their wrap objects.
         """
         model = self.opensim.Model(str(JW / "JW.osim"))
         forces = model.updForceSet()
@@ -106,13 +106,13 @@ class Tools:
         for name in () if wraps else muscles:
             path = self.opensim.Muscle.safeDownCast(forces.get(name)).updGeometryPath()
             path.updWrapSet().clearAndDestroy()
-        known = self.trial.kinematics.model
-        followers = {coupler.dependent for coupler in known.couplers}
+        read_model = self.trial.kinematics.model
+        followers = {coupler.dependent for coupler in read_model.couplers}
         for k in range(model.getCoordinateSet().getSize()):
             coordinate = model.getCoordinateSet().get(k)
             coordinate.setDefaultClamped(False)
             name = coordinate.getName()
-            if known.coordinates[name].locked or name in followers:
+            if read_model.coordinates[name].locked or name in followers:
                 continue
             actuator = self.opensim.CoordinateActuator(name)
             actuator.setName(f"reserve_{name}")
@@ -125,7 +125,7 @@ class Tools:
         return self.folder / "muscles.osim"
 
     def static_optimisation(self, first: float, last: float, every: int) -> tuple[dict, float]:
-        """Return activations by muscle at the times, and processor seconds."""
+        """Return muscle -> activations at every `every`-th time, and processor time, s."""
         analysis = self.opensim.StaticOptimization()
         analysis.setName("StaticOptimization")
         analysis.setUseMusclePhysiology(False)
@@ -138,7 +138,7 @@ class Tools:
     def moment_arms(
         self, coordinates: tuple[str, ...], first: float, last: float, every: int
     ) -> dict[str, dict]:
-        """Return coordinate -> moment arms by muscle, constraints included."""
+        """Return coordinate -> muscle -> moment arms, with the model's constraints."""
         analysis = self.opensim.MuscleAnalysis()
         analysis.setName("MuscleAnalysis")
         analysis.setComputeMoments(True)
@@ -151,7 +151,10 @@ class Tools:
         return {name: read_table(Path(f"{stem}{name}.sto")).columns for name in coordinates}
 
     def knee_reaction(self, first: float, last: float, every: int) -> tuple[dict, float]:
-        """Return force and moment on the tibia at the tray's weld, in ground, with those forces."""
+        """Return force and moment on the tibia at the tray, ground frame, and processor time, s.
+
+        Muscle forces are those of `static_optimisation`.
+        """
         analysis = self.opensim.JointReaction()
         analysis.setName("JointReaction")
         analysis.setForcesFileName(str(self.folder / "so_StaticOptimization_force.sto"))

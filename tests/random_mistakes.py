@@ -1,8 +1,8 @@
-"""Mistakes at random: single cells, columns, scene keys, URDF edits; each drawn from a seed.
+"""Random mistakes in input files: single cells, columns, scene keys, URDF edits.
 
-A mistake here is one that a reader of the file would see as one: a factor of ten, a sign, a unit,
-an axis, a neighbour's column, a word. It moves a place by 30 mm, an angle by 6 deg or a force by
-a tenth of the peak, or more; what is smaller is another patient, and no program can know.
+A mistake is for example a factor of ten, a sign, a unit, an axis, a neighbouring column or a
+misspelt word. It changes a position by at least 30 mm, an angle by 6 deg or a force by a tenth of
+the peak. A smaller change could be another patient, so no program can detect it.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -12,19 +12,26 @@ import numpy as np
 from mistakes import cells_of, set_key, text_of
 
 LEAST = {"deg": 6.0, "mm": 30.0, "m": 0.03, "rad": 0.1, "N": 0.1}
-"""The least change that is a mistake; of forces, in peaks."""
+"""Unit -> smallest change that is a mistake. Forces: as a share of their peak."""
 
 
 def random_mistakes(bench, rng, urdf, others):
-    """Return (name, edit) for so many random edits of the URDF and of tables and scene keys."""
-    found = [("urdf", urdf_edit)] * urdf
-    found += [(("cell", cell_edit), ("column", column_edit), ("key", key_edit))[k % 3]
+    """Return (name, edit) of random edits.
+
+    Args:
+        bench: scene to edit.
+        rng: random generator.
+        urdf: number of edits of the URDF.
+        others: number of edits of tables and scene keys.
+    """
+    kinds = [("urdf", urdf_edit)] * urdf
+    kinds += [(("cell", cell_edit), ("column", column_edit), ("key", key_edit))[k % 3]
               for k in range(others)]  # fmt: skip
-    made = []
-    for kind, make in found:
+    edits = []
+    for kind, make in kinds:
         name, edit = make(bench, np.random.default_rng(rng.integers(2**63)))
-        made.append((f"{kind}: {name}", edit))
-    return made
+        edits.append((f"{kind}: {name}", edit))
+    return edits
 
 
 def pick(rng, items):
@@ -37,7 +44,7 @@ def pick(rng, items):
 
 
 def urdf_edit(bench, rng):
-    """Return a random edit of the URDF that changes more than its looks."""
+    """Return name and function of a random edit of the URDF."""
     text = bench.texts["patient.urdf"]
     while True:
         robot = ElementTree.fromstring(text)
@@ -83,7 +90,7 @@ def _inner_origin(robot, rng):
 
 
 def _place(robot, rng):
-    """Move knee_ap, hip or a mount by a sign, a factor or a permutation."""
+    """Change the origin of knee_ap or of a fixed joint by a sign, a factor or a permutation."""
     joint = pick(rng, [j for j in robot.findall("joint") if j.get("name") == "knee_ap"
                        or j.get("type") == "fixed"])  # fmt: skip
     origin = joint.find("origin")
@@ -174,7 +181,7 @@ def _inner_mass(robot, rng):
 
 
 def _order(robot, rng):
-    """Exchange two joints' places."""
+    """Exchange the positions of two joints in the chain."""
     prefix = pick(rng, ("knee_", "patella_"))
     joints = [j for j in robot.findall("joint") if _moves(j, prefix)]
     one, other = (joints[k] for k in rng.choice(len(joints), 2, replace=False))
@@ -215,7 +222,7 @@ def _misspelt(word, rng):
 
 
 def _ends(robot, rng):
-    """Hang a joint somewhere else."""
+    """Give a joint another parent or child."""
     joint = pick(rng, robot.findall("joint"))
     end = joint.find(pick(rng, ("parent", "child")))
     links = {link.get("name") for link in robot.findall("link")} - {end.get("link")}
@@ -252,7 +259,7 @@ URDF_EDITS = (
 
 
 def _table(bench, rng):
-    """Return a file's name, its rows, where the data begin, and its separator."""
+    """Return the name of a random table, its rows, index of the first data row, and separator."""
     name = pick(rng, [n for n in sorted(bench.texts) if n.endswith((".csv", ".sto"))])
     separator = "," if name.endswith(".csv") else "\t"
     rows = cells_of(bench.texts[name], separator)
@@ -261,7 +268,7 @@ def _table(bench, rng):
 
 
 def _used(bench, name, header):
-    """Return the columns of a table that the scene uses (index -> unit), time left out."""
+    """Return index -> unit of the columns that the scene uses, without time."""
     table = next(t for t in bench.content.values() if isinstance(t, dict) and t.get("file") == name)
     roles = {column: role for role, column in table.get("columns", {}).items()}
     angle, length = table.get("angle_unit", "deg"), table.get("length_unit", "mm")
@@ -285,7 +292,7 @@ ROTATIONS = ("flexion", "adduction", "axial_rotation", "patella_rotation")
 
 
 def _rows_in_use(bench, name, rows, start):
-    """Return the indices of rows within the frames, or of loaded ones of a plate."""
+    """Return the indices of data rows; of a force plate, of loaded rows within the cycle."""
     content = bench.content
     if name != content.get("ground_reaction", {}).get("file"):
         return list(range(start, len(rows)))
@@ -412,7 +419,7 @@ def _keys(content, above=""):
 
 
 def _mistaken(where, old, rng):
-    """Return another value, mistaken, of a key; None where there is none."""
+    """Return a mistaken value of a key; None: no mistake is defined for this key."""
     key = where.split(".")[-1]
     if key in ("length_unit", "unit"):
         return pick(rng, sorted({"m", "cm", "mm"} - {old}))

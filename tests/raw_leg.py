@@ -1,7 +1,7 @@
-"""A leg from the raw files: where its segments are, how they accelerate, what is known to load it.
+"""A leg from the raw files: poses, accelerations and known loads of its segments.
 
-Nothing of tkamb: URDF, scene file and tables are read here and in `raw_files`. Poses are in
-the laboratory (x forward, y up, z right), SI.
+This file and `raw_files` read URDF, scene file and tables without tkamb. Poses are in the
+laboratory frame (x forward, y up, z right), SI.
 """
 
 import itertools
@@ -29,24 +29,25 @@ from raw_files import (
 
 G = np.array([0.0, -9.80665, 0.0])
 STEP = 5e-4
-"""s; of the differences that give velocities and accelerations."""
+"""Time step of the differences for velocities and accelerations, s."""
 MARGIN = 1.5
-"""s of the record on both sides of the motion that are filtered with it."""
+"""Length of the recording before and after the motion that is filtered with it, s."""
 METRES = {"m": 1.0, "mm": 1e-3}
 KNEE = ("knee_ap", "knee_si", "knee_ml", "knee_axial_rotation", "knee_adduction", "knee_flexion")
 PATELLA = ("patella_ap", "patella_si", "patella_rotation")
 
 
 class Leg:
-    """A scene's leg: poses and accelerations of its segments, loads that are known."""
+    """The leg of a scene: poses, accelerations and known loads of its segments."""
 
     def __init__(self, scene_path, insert_mesh_in_insert=None, patella=None):
         """Read the scene's files.
 
         Args:
-            scene_path: of the scene.
-            insert_mesh_in_insert: (4, 4), lent, where the motion is in the insert mesh's axes.
-            patella: (times (f,), coordinates (f, 3)), lent, where no patella was recorded.
+            scene_path: path of the scene file.
+            insert_mesh_in_insert: pose (4, 4) from tkamb, if the motion is in the axes of the
+                insert mesh.
+            patella: times (f,) and coordinates (f, 3) from tkamb, if no patella was recorded.
         """
         self.folder = Path(scene_path).parent
         self.scene = tomllib.loads(Path(scene_path).read_text(encoding="utf-8"))
@@ -62,7 +63,7 @@ class Leg:
             self._read_coordinates()
 
     def file(self, *keys):
-        """Return the path that the scene names."""
+        """Return the path under these keys of the scene."""
         inner = self.scene
         for key in keys:
             inner = inner[key]
@@ -118,19 +119,19 @@ class Leg:
         joints = table["joint_centre"]
         names = [*table["markers_mm"], *(name for j in joints for name in j["markers_mm"])]
         path = self.file("tibia", "file")
-        stamps, seen = read_markers(path, names, self.time[0] - MARGIN, self.time[-1] + MARGIN)
-        here = axes_matrix(table["laboratory_axes"])
-        seen = {name: places @ here.T / 1e3 for name, places in seen.items()}
-        own = list(table["markers_mm"].values()) + [joint["tibia_mm"] for joint in joints]
+        stamps, markers = read_markers(path, names, self.time[0] - MARGIN, self.time[-1] + MARGIN)
+        axes = axes_matrix(table["laboratory_axes"])
+        markers = {name: places @ axes.T / 1e3 for name, places in markers.items()}
+        in_tibia = list(table["markers_mm"].values()) + [joint["tibia_mm"] for joint in joints]
         poses = []
         for k in range(len(stamps)):
-            points = [seen[name][k] for name in table["markers_mm"]]
+            points = [markers[name][k] for name in table["markers_mm"]]
             for joint in joints:
                 neighbours = joint["markers_mm"]
-                carried = fit(neighbours.values(), [seen[name][k] for name in neighbours])
+                segment = fit(neighbours.values(), [markers[name][k] for name in neighbours])
                 centre = np.array(joint["centre_mm"]) / 1e3
-                points.append(carried[:3, :3] @ centre + carried[:3, 3])
-            poses.append(fit(own, points))
+                points.append(segment[:3, :3] @ centre + segment[:3, 3])
+            poses.append(fit(in_tibia, points))
         return stamps, np.array(poses)
 
     def in_tibia(self, link, t):
@@ -147,7 +148,7 @@ class Leg:
         return self.shank(t) @ self.in_tibia(link, t)
 
     def insert_in_laboratory(self, t):
-        """Return the pose of the insert frame: the origin of the knee's first joint."""
+        """Return the pose of the insert frame, which is the origin of the joint knee_ap."""
         return self.shank(t) @ self._origin(self.parent["knee_ap_link"])
 
     @staticmethod
@@ -179,21 +180,25 @@ class Leg:
     def needed(self, link, t):
         """Return the wrench (force, moment about the laboratory's origin) that moves a segment.
 
-        It is m (a - g) at the centre of mass and the rate of angular momentum about it.
+        The force is m (a - g) at the centre of mass. The moment about the centre of mass is the
+        rate of angular momentum.
         """
-        own, mass, tensor = self._inertia(link)
-        before, here, after = (self.in_laboratory(link, t + d) @ own for d in (-STEP, 0.0, STEP))
-        acceleration = (after[:3, 3] - 2 * here[:3, 3] + before[:3, 3]) / STEP**2
+        centre, mass, tensor = self._inertia(link)
+        before, now, after = (self.in_laboratory(link, t + d) @ centre for d in (-STEP, 0.0, STEP))
+        acceleration = (after[:3, 3] - 2 * now[:3, 3] + before[:3, 3]) / STEP**2
         spins = []
-        for one, other in ((before, here), (here, after)):
+        for one, other in ((before, now), (now, after)):
             turn = Rotation.from_matrix(other[:3, :3] @ one[:3, :3].T)
             middle = Rotation.from_rotvec(turn.as_rotvec() / 2).as_matrix() @ one[:3, :3]
             spins.append(middle @ tensor @ middle.T @ turn.as_rotvec() / STEP)
         force = mass * (acceleration - G)
-        return np.concatenate([force, np.cross(here[:3, 3], force) + (spins[1] - spins[0]) / STEP])
+        return np.concatenate([force, np.cross(now[:3, 3], force) + (spins[1] - spins[0]) / STEP])
 
     def _inertia(self, link):
-        """Return pose of the centre of mass in the link, mass, inertia; no entry: the patella."""
+        """Return pose of the centre of mass in the link, mass, inertia.
+
+        A link without inertia is the patella, a mass of 0.1 kg at the centroid of its button.
+        """
         inertial = self.links[link].find("inertial")
         if inertial is None:
             table = self.scene["implant"]["patella"]
@@ -229,7 +234,7 @@ class Leg:
         return smoothed(stamps[near], wrench[near], table["cutoff_Hz"])
 
     def ligaments(self, t):
-        """Return (tension, proximal point, distal point) of each bundle, laboratory."""
+        """Return (tension, proximal point, distal point) of each bundle, laboratory frame."""
         links = {b[end]["link"] for b in self.scene["ligament"] for end in ("proximal", "distal")}
         poses = {link: self.in_laboratory(link, t) for link in links}
         result = []
@@ -240,7 +245,7 @@ class Leg:
         return result
 
     def ends(self, line, t):
-        """Return (link, point in the laboratory) of both ends of a muscle line, proximal first."""
+        """Return (link, point in the laboratory frame) of both ends of a muscle line."""
         tables = [
             end for end in self.scene[line].values() if isinstance(end, dict) and "link" in end
         ]
@@ -249,12 +254,12 @@ class Leg:
 
 
 def carry(body, point_mm):
-    """Return a body's point in the frame of its pose, m."""
+    """Return a point of a body in the frame of the body's pose, m."""
     return body[:3, :3] @ np.array(point_mm) / 1e3 + body[:3, 3]
 
 
 def tension(bundle, length):
-    """Return a bundle's tension: two lines (Shin 2007), or a quadratic toe (Blankevoort 1991)."""
+    """Return a bundle's tension by the law of two lines (Shin 2007) or a toe (Blankevoort 1991)."""
     slack = bundle["slack_length_mm"] / 1e3
     strain = (length - slack) / slack
     if strain <= 0:

@@ -6,7 +6,7 @@ import ezc3d
 import numpy as np
 
 AMTI_CORNERS = np.array([[0.6, 0.4, 0.0], [0.0, 0.4, 0.0], [0.0, 0.0, 0.0], [0.6, 0.0, 0.0]])
-"""m; the surface of a plate whose own x is the file's x and whose y is the file's y."""
+"""Corners of a plate with axes x and y parallel to the file's, m."""
 
 
 def write_c3d(
@@ -21,7 +21,7 @@ def write_c3d(
     plates: list[dict] | None = None,
     point_unit: str = "mm",
 ) -> Path:
-    """Write markers (n, 3) m, channels (n * ratio) and plates; each plate's entries in m."""
+    """Write markers (n, 3), m, analog channels (n * ratio) and plates with lengths in m."""
     scale = {"mm": 1e3, "m": 1.0}.get(point_unit, 1.0)
     count = len(next(iter(markers.values())))
     c = ezc3d.c3d()
@@ -61,7 +61,7 @@ def _add_plates(c: ezc3d.c3d, plates: list[dict], scale: float) -> None:
 
 
 def standing_markers(count: int = 20) -> dict[str, np.ndarray]:
-    """Return a few markers (n, 3) m that move a little."""
+    """Return markers (n, 3), m, that sway a little."""
     sway = 0.01 * np.sin(np.linspace(0.0, 6.0, count))
     places = {"JW:RHeel": (0.3, 0.2, 0.05), "JW:RToe": (0.5, 0.2, 0.04), "JW:Sacral": (0.3, 0.3, 1)}
     return {

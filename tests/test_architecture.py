@@ -1,4 +1,4 @@
-"""Data flows one way: which folder may import which, read from the code itself."""
+"""Layers of the package: a folder imports only from lower folders."""
 
 import ast
 from pathlib import Path
@@ -8,15 +8,15 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "tkamb"
 
 ORDER = ("geometry", "contact", "knee", "io", "run", "studies", "show", "commands")
-"""From the lowest folder to the highest: each imports from those before it, and from itself."""
+"""Folders from the lowest to the highest. Each imports only from lower ones and itself."""
 SERVES_ALL = {"errors", "files", "units"}
-"""Modules beside the folders, without knees: numbers, files, memory, messages."""
+"""Modules that every folder may import."""
 ON_TOP = {"__init__", "__main__", "cli", "moved", "testing"}
-"""Modules that may import all."""
+"""Modules that may import every folder."""
 
 
 def imported(path):
-    """Return the tkamb modules that a file imports, those for type checking left out."""
+    """Return the tkamb modules that a file imports, except for type checking."""
     names, tree = set(), ast.parse(path.read_text(encoding="utf-8"))
     typing = {
         inner
@@ -35,14 +35,14 @@ def imported(path):
 
 
 def part_of(name):
-    """Return the folder, or the module beside the folders, that a dotted name belongs to."""
+    """Return the folder or top-level module of a dotted name; "" for the package itself."""
     parts = name.split(".")
-    public = {"__version__", "code_identity"}  # of the package itself, beside no folder
+    public = {"__version__", "code_identity"}  # names in the package's __init__
     return parts[1] if len(parts) > 1 and parts[1] not in public else ""
 
 
 @pytest.mark.parametrize("folder", ORDER)
-def test_every_arrow_points_down(folder):
+def test_folders_import_only_lower_folders(folder):
     lower = {*ORDER[: ORDER.index(folder) + 1], *SERVES_ALL, ""}
     for path in (PACKAGE / folder).rglob("*.py"):
         for name in imported(path):
@@ -61,14 +61,13 @@ def test_there_are_no_other_folders_and_modules():
     assert {path.stem for path in PACKAGE.glob("*.py")} == SERVES_ALL | ON_TOP
 
 
-def test_the_layer_test_can_fail():
+def test_imported_modules_are_found():
     names = imported(PACKAGE / "run" / "mechanics.py")
     assert "tkamb.knee.instant" in names
     assert part_of("tkamb.knee.instant") == "knee"
 
 
-def test_the_physics_knows_no_scene():
-    """Geometry, contact and knee take arrays and objects; only `io` knows a file."""
+def test_physics_does_not_import_scenes_or_files():
     for folder in ("geometry", "contact", "knee"):
         for path in (PACKAGE / folder).rglob("*.py"):
             assert not any(part_of(name) in ("io", "run") for name in imported(path)), path
@@ -80,9 +79,9 @@ def module_name(path):
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def circles(graph):
-    """Return the sets of modules that can reach each other: depth first, after Tarjan (1972)."""
-    order, low, stack, found = {}, {}, [], []
+def cycles(graph):
+    """Return the strongly connected components with more than one module (Tarjan 1972)."""
+    order, low, stack, components = {}, {}, [], []
 
     def visit(node):
         order[node] = low[node] = len(order)
@@ -94,21 +93,21 @@ def circles(graph):
                 low[node] = min(low[node], low[other])
         if low[node] == order[node]:
             first = stack.index(node)
-            found.append(set(stack[first:]))
+            components.append(set(stack[first:]))
             del stack[first:]
 
     for node in graph:
         if node not in order:
             visit(node)
-    return [one for one in found if len(one) > 1]
+    return [one for one in components if len(one) > 1]
 
 
-def test_no_circle_of_imports_late_ones_counted():
+def test_imports_have_no_cycle():
     files = {module_name(path): path for path in PACKAGE.rglob("*.py")}
     graph = {name: imported(path) & set(files) for name, path in files.items()}
     assert graph["tkamb.run.simulation"]
-    assert circles(graph) == []
+    assert cycles(graph) == []
 
 
-def test_a_circle_is_found():
-    assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [{"a", "b", "c"}]
+def test_a_cycle_of_imports_is_found():
+    assert cycles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [{"a", "b", "c"}]

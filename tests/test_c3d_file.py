@@ -1,4 +1,4 @@
-"""The container of C3D files: machines, integers, long recordings, damage, and a second reader."""
+"""C3D files: byte orders, integers, long recordings, damage, and comparison with ezc3d."""
 
 import os
 import sys
@@ -32,30 +32,30 @@ def raw(machine="intel", **options):
 
 @pytest.mark.parametrize("integers", [False, True], ids=["floats", "integers"])
 @pytest.mark.parametrize("machine", MACHINES)
-def test_every_machines_numbers_are_read(tmp_path, machine, integers):
+def test_numbers_of_every_processor_type_are_read(tmp_path, machine, integers):
     path = raw(machine, integers=integers, first=31).write(tmp_path / "a.c3d", POINTS, ANALOG)
     recording = read_c3d(path)
     np.testing.assert_allclose(recording.points, POINTS * 1e-3, atol=1e-7)
     volts = (ANALOG - [3, 7]) * [0.01, 0.5] * 2.0
-    found = np.stack([recording.channels[name] for name in ("emg one", "emg two")], axis=1)
-    np.testing.assert_allclose(found, volts, rtol=1e-6)
+    channels = np.stack([recording.channels[name] for name in ("emg one", "emg two")], axis=1)
+    np.testing.assert_allclose(channels, volts, rtol=1e-6)
     np.testing.assert_allclose(recording.time, (30 + np.arange(12)) / 100.0)
     if machine == "mips":
-        return  # the second reader reads none of these
+        return  # ezc3d cannot read this type
     theirs = ezc3d.c3d(str(path))["data"]
-    np.testing.assert_allclose(found.T, theirs["analogs"][0], rtol=1e-6)
-    seen = np.isfinite(recording.points)
+    np.testing.assert_allclose(channels.T, theirs["analogs"][0], rtol=1e-6)
+    visible = np.isfinite(recording.points)
     points = theirs["points"][:3].transpose(2, 1, 0) * 1e-3
-    np.testing.assert_allclose(recording.points[seen], points[seen], atol=1e-9)
+    np.testing.assert_allclose(recording.points[visible], points[visible], atol=1e-9)
 
 
-def test_a_negative_offset_is_subtracted_too(tmp_path):
+def test_a_negative_offset_is_subtracted(tmp_path):
     file = raw().add("ANALOG", "OFFSET", [3, -7])
     recording = read_c3d(file.write(tmp_path / "a.c3d", POINTS, ANALOG))
     np.testing.assert_allclose(recording.channels["emg two"], (ANALOG[:, 1] + 7), rtol=1e-6)
 
 
-def test_unsigned_analog_words_count_to_65535(tmp_path):
+def test_unsigned_analog_values_reach_65535(tmp_path):
     file = (
         raw(integers=True)
         .add("ANALOG", "FORMAT", ["UNSIGNED"])
@@ -68,13 +68,13 @@ def test_unsigned_analog_words_count_to_65535(tmp_path):
 
 @pytest.mark.skipif(not JW.is_dir(), reason="subject JW's recordings are not beside the project")
 @pytest.mark.parametrize("name", ["jw_ngait_og3", "jw_2legsquat1", "jw_1legstand1"])
-def test_markers_and_plates_are_those_of_a_second_reader(name):
+def test_markers_and_plates_agree_with_ezc3d(name):
     path = JW / f"{name}.c3d"
     mine, theirs = read_c3d(path), ezc3d.c3d(str(path), extract_forceplat_data=True)
     points = theirs["data"]["points"][:3].transpose(2, 1, 0) * 1e-3
-    seen = np.isfinite(mine.points)
-    np.testing.assert_array_equal(mine.points[seen], points[seen])
-    assert np.isnan(points[~seen]).all() or (points[~seen] == 0).all()
+    visible = np.isfinite(mine.points)
+    np.testing.assert_array_equal(mine.points[visible], points[visible])
+    assert np.isnan(points[~visible]).all() or (points[~visible] == 0).all()
     assert mine.first_frame == theirs["header"]["points"]["first_frame"]
     for plate, other in zip(mine.plates, theirs["data"]["platform"], strict=True):
         np.testing.assert_allclose(plate.force.T, other["force"], atol=1e-9)
@@ -91,7 +91,7 @@ def long_points(count):
     ("first", "how"),
     [(1, "TRIAL"), (101, "TRIAL"), (1, "LONG_FRAMES"), (1, "wrapped"), (1, "FRAMES")],
 )
-def test_more_frames_than_16_bits_count_are_read_to_the_end(tmp_path, first, how):
+def test_recordings_of_more_than_65535_frames_are_read_completely(tmp_path, first, how):
     count = 70_000
     file = RawC3d(first=first)
     file.add("POINT", "LABELS", ["A"]).add("POINT", "UNITS", ["mm"])
@@ -111,37 +111,37 @@ def test_more_frames_than_16_bits_count_are_read_to_the_end(tmp_path, first, how
 
 
 @pytest.mark.parametrize("stated", [65535, 70_000 - 65_536])
-def test_frames_that_nothing_counts_are_refused_by_their_number(tmp_path, stated):
+def test_a_wrong_number_of_frames_is_refused(tmp_path, stated):
     file = RawC3d().add("POINT", "LABELS", ["A"]).add("POINT", "UNITS", ["mm"])
     path = file.write(tmp_path / "a.c3d", long_points(70_000), frames=stated)
     with pytest.raises(InputError, match=r"long enough for 700\d\d"):
         read_c3d(path)
 
 
-def test_header_and_parameters_that_contradict_each_other_are_refused(tmp_path):
+def test_contradictory_header_and_parameters_are_refused(tmp_path):
     path = raw().write(tmp_path / "a.c3d", POINTS, ANALOG)
     content = bytearray(path.read_bytes())
-    content[2] = 7  # markers, by the header
+    content[2] = 7  # number of markers in the header
     path.write_bytes(content)
     with pytest.raises(InputError, match="holds 7 markers by its header, 3 by POINT:USED"):
         read_c3d(path)
 
 
-def test_wrong_bytes_end_in_a_recording_or_in_one_line(tmp_path):
+def test_damaged_files_are_read_or_refused(tmp_path):
     c3d = raw("mips", integers=True).write(tmp_path / "a.c3d", POINTS, ANALOG)
     trc = tmp_path / "a.trc"
     write_trc(trc, np.arange(20) / 100.0, standing_markers(20), 100.0)
-    said = []
+    results = []
     for seed in range(300):
         source = (c3d, trc)[seed % 2]
         path = tmp_path / f"damaged{source.suffix}"
         words = WORDS if source is c3d else TEXTS
         path.write_bytes(damaged(source.read_bytes(), seed, words))
-        said.append(read_all(path))
-    assert 20 < said.count("read") < 280  # both happen
+        results.append(read_all(path))
+    assert 20 < results.count("read") < 280  # some files are read, some refused
 
 
-def test_a_parameter_of_many_dimensions_is_damaged(tmp_path):
+def test_a_parameter_with_too_many_dimensions_is_refused(tmp_path):
     path = raw().write(tmp_path / "a.c3d", POINTS, ANALOG)
     content = bytearray(path.read_bytes())
     at = content.index(b"SCALE") + 5 + 2
@@ -152,7 +152,7 @@ def test_a_parameter_of_many_dimensions_is_damaged(tmp_path):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no FIFO in its folders")
-def test_what_is_no_regular_file_is_refused_before_it_is_read(tmp_path):
+def test_paths_that_are_not_regular_files_are_refused(tmp_path):
     os.mkfifo(tmp_path / "fifo.c3d")
     (tmp_path / "folder.c3d").mkdir()
     (tmp_path / "device.c3d").symlink_to("/dev/zero")
@@ -164,8 +164,7 @@ def test_what_is_no_regular_file_is_refused_before_it_is_read(tmp_path):
             read_c3d(tmp_path / f"{name}.c3d")
 
 
-def test_markers_are_read_where_the_analog_rate_is_wrong(tmp_path):
-    """The header lays out the data; a wrong rate concerns the channels alone."""
+def test_markers_are_read_despite_a_wrong_analog_rate(tmp_path):
     file = raw().add("ANALOG", "RATE", np.array([1500.0]))
     recording = read_c3d(file.write(tmp_path / "a.c3d", POINTS, ANALOG))
     np.testing.assert_allclose(recording.points, POINTS * 1e-3, atol=1e-7)
@@ -174,7 +173,7 @@ def test_markers_are_read_where_the_analog_rate_is_wrong(tmp_path):
     assert "1500 Hz" in recording.all_notices[0]
 
 
-def test_labels_beyond_255_stand_in_a_second_parameter(tmp_path):
+def test_more_than_255_labels_are_read_from_a_second_parameter(tmp_path):
     markers = {f"M{k}": np.zeros((3, 3)) + 0.001 * (k + 1) for k in range(300)}
     recording = read_c3d(write_c3d(tmp_path / "a.c3d", markers))
     assert recording.labels[299] == "M299"

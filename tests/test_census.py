@@ -1,4 +1,4 @@
-"""`scripts/census_recordings`: what is read, in part, refused, and read otherwise."""
+"""`scripts/census_recordings`: files that are read, partly read or refused, and differences."""
 
 import json
 import subprocess
@@ -14,7 +14,7 @@ from recordings import standing_markers, write_c3d
 SCRIPT = Path(__file__).parents[1] / "scripts" / "census_recordings"
 
 
-def test_a_census_tells_read_from_part_and_refused(tmp_path):
+def test_a_census_classifies_files(tmp_path):
     folder = tmp_path / "files"
     (folder / "deeper").mkdir(parents=True)
     time = np.arange(200) / 1000.0
@@ -31,7 +31,7 @@ def test_a_census_tells_read_from_part_and_refused(tmp_path):
     trimesh.creation.box().export(folder / "box.stl")
     trimesh.Trimesh(np.eye(3), [[0, 1, 2]]).export(folder / "open.stl")
     command = [sys.executable, str(SCRIPT), str(folder), "--json", str(tmp_path / "rows.json")]
-    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     rows = {row["file"]: row for row in json.loads((tmp_path / "rows.json").read_text())}
     results = {name: row["result"] for name, row in rows.items()}
     assert results == {
@@ -46,19 +46,19 @@ def test_a_census_tells_read_from_part_and_refused(tmp_path):
     assert "type 7" in rows["deeper/plate.c3d"]["why"][0]
     compared = {name: row["compared"] for name, row in rows.items()}
     assert compared == {
-        "a.csv": [],  # no second reader reads tables of text
+        "a.csv": [],  # there is no second reader of text tables
         "box.stl": ["extents", "volume"],
         "cut.c3d": [],
         "deeper/plate.c3d": ["time", "markers"],
         "good.c3d": ["time", "markers", "plate 1"],
-        "leg.osim": rows["leg.osim"]["compared"],  # only where OpenSim is installed
+        "leg.osim": rows["leg.osim"]["compared"],  # not empty only if OpenSim is installed
         "open.stl": ["extents"],
     }
-    assert f"compared with a second reader: {sum(map(bool, compared.values()))}" in said
-    assert "2 part, 4 read, 1 refused" in said and "cut short" in said
+    assert f"compared with a second reader: {sum(map(bool, compared.values()))}" in output
+    assert "2 part, 4 read, 1 refused" in output and "cut short" in output
 
 
-def test_a_census_finds_what_a_second_reader_reads_otherwise(tmp_path):
+def test_a_census_finds_differences_from_a_second_reader(tmp_path):
     from importlib.machinery import SourceFileLoader
     from importlib.util import module_from_spec, spec_from_loader
 

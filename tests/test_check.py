@@ -1,4 +1,4 @@
-"""`tkamb check`: what a scene gives and what it asks, without a run."""
+"""`tkamb check`: content of a scene and questions on it, without a run."""
 
 import json
 from dataclasses import replace
@@ -19,7 +19,7 @@ from tkamb.show.scene_check import _listed, _missing, check_scene
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
-    """Return the starter scene with a measured force beside it."""
+    """Return the path of the starter scene, with a measured force."""
     path = lay_out(tmp_path_factory.mktemp("check") / "knee")
     (path.parent / "implant.csv").write_text("time,F\n1.0,367.75\n2.0,1471\n3.3,735.5\n")
     table = (
@@ -34,15 +34,15 @@ def checked(scene):
     return check_scene(scene)
 
 
-def test_it_says_what_each_file_gave_and_writes_the_picture_alone(scene, capfd):
+def test_a_check_lists_each_file_and_writes_only_the_picture(scene, capfd):
     before = sorted(scene.parent.iterdir())
     picture = scene.parent / "leg.png"
     assert main(["check", str(scene), "--out", str(picture)]) == 0
-    said = capfd.readouterr().out
-    assert "motion (motion.csv): 6 frames" in said
-    assert "flexion 28.0 to 107.9 deg" in said
-    assert "measured force (implant.csv): total 0.50 to 2.00 BW, 3 samples" in said
-    assert "question: none" in said and "not modelled: " in said
+    output = capfd.readouterr().out
+    assert "motion (motion.csv): 6 frames" in output
+    assert "flexion 28.0 to 107.9 deg" in output
+    assert "measured force (implant.csv): total 0.50 to 2.00 BW, 3 samples" in output
+    assert "question: none" in output and "not modelled: " in output
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert sorted(scene.parent.iterdir()) == sorted([*before, picture])
     picture.unlink()
@@ -59,11 +59,11 @@ def test_it_says_what_each_file_gave_and_writes_the_picture_alone(scene, capfd):
         (["a09", "a10", "a11", "a12"], "a09, a10, a11, a12"),
     ],
 )
-def test_names_that_count_up_are_one_word(names, words):
+def test_consecutively_numbered_names_are_abbreviated(names, words):
     assert _listed(names) == words
 
 
-def test_a_ground_reaction_in_the_wrong_unit_is_asked_about(scene, checked):
+def test_a_ground_reaction_in_the_wrong_unit_raises_a_question(scene, checked):
     assert checked.questions == ()
     table = scene.parent / "ground_reaction.csv"
     text = table.read_text()
@@ -74,13 +74,13 @@ def test_a_ground_reaction_in_the_wrong_unit_is_asked_about(scene, checked):
         for k in forces:
             row[k] = str(9.80665 * float(row[k]))
     table.write_text("\n".join([header, *(",".join(row) for row in cells)]) + "\n")
-    asked = check_scene(scene).as_dict()
+    result = check_scene(scene).as_dict()
     table.write_text(text)
-    assert any("ground reaction" in question for question in asked["questions"])
-    assert json.loads(json.dumps(asked)) == asked
+    assert any("ground reaction" in question for question in result["questions"])
+    assert json.loads(json.dumps(result)) == result
 
 
-def test_the_leg_is_drawn_where_the_chain_and_the_plate_are(checked):
+def test_the_drawn_leg_agrees_with_the_chain_and_the_force_plate(checked):
     """Segments keep their lengths, the hip is above the ankle, the force acts on the plate."""
     case = checked.case
     frames = [leg_frame(case, checked.mechanics, k) for k in shown_frames(case)]
@@ -97,21 +97,21 @@ def test_the_leg_is_drawn_where_the_chain_and_the_plate_are(checked):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--out", "leg.jpg"], "none of .png, .html"),
+        (["--out", "leg.jpg"], "does not end in .png or .html"),
         (["--set", "contact.model=magic"], "magic"),
         (["--set", "contact.material=cheese"], "polyethylene"),
         (["--set", "motion.file=no.csv"], "no.csv"),
     ],
 )
-def test_bad_input_is_one_line(scene, tmp_path, monkeypatch, capfd, arguments, words):
+def test_bad_input_gives_one_line(scene, tmp_path, monkeypatch, capfd, arguments, words):
     monkeypatch.chdir(tmp_path)
     assert main(["check", str(scene), *arguments]) == 2
-    said = capfd.readouterr().err
-    assert words in said and said.count("\n") == 1
+    error = capfd.readouterr().err
+    assert words in error and error.count("\n") == 1
     assert not list(tmp_path.iterdir())
 
 
-def test_the_page_holds_questions_picture_and_files(checked):
+def test_the_page_has_the_files_and_the_picture(checked):
     figure = Figure()
     figure.add_subplot()
     text = check_html(checked, figure)
@@ -120,8 +120,7 @@ def test_the_page_holds_questions_picture_and_files(checked):
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
-def test_the_picture_says_which_side_is_medial_and_names_the_ligaments(side, tmp_path):
-    """The MCL stands on the page where "medial" is written, of a right and of a left knee."""
+def test_the_mcl_is_drawn_on_the_side_labelled_medial(side, tmp_path):
     scene = MODEL / "scene.toml" if side == "right" else write_mirrored_patient(tmp_path)
     checked = check_scene(scene)
     figure = draw_leg(checked.case, checked.mechanics)
@@ -133,8 +132,7 @@ def test_the_picture_says_which_side_is_medial_and_names_the_ligaments(side, tmp
     assert (mcl < lcl) == medial
 
 
-def test_a_solver_that_is_not_installed_is_named_before_a_run(checked, monkeypatch):
-    """The muscles' solver is an extra: the check names it first, and still shows the leg."""
+def test_a_check_names_a_solver_that_is_not_installed(checked, monkeypatch):
     monkeypatch.setattr(static_optimisation, "find_spec", lambda name: None)
     plain = checked.case
     assert _missing(plain) == ()

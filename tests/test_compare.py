@@ -1,4 +1,4 @@
-"""`tkamb compare`: known differences come out, and what is not the same is said."""
+"""`tkamb compare`: differences between runs, and notes on different settings."""
 
 import json
 from dataclasses import replace
@@ -18,12 +18,12 @@ from tkamb.show.comparison_page import shown_frame
 
 
 def written(folder, results, **summary):
-    """Write results, no report, with keys of the summary changed; return the folder."""
+    """Write results without a report, with changed keys of the summary; return the folder."""
     return keep(replace(results, summary=results.summary | summary), folder)
 
 
 def chosen(results, frames):
-    """Return results with these frames alone, without maps."""
+    """Return results of these frames, without maps."""
     columns = {
         name: [values[k] for k in frames] if name == "status" else values[frames]
         for name, values in results.columns.items()
@@ -33,7 +33,10 @@ def chosen(results, frames):
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
-    """A bend, and the same with 7 N more at 60 deg, a failed frame and another model."""
+    """Return folders of two runs.
+
+    The second has 7 N more force at 60 deg, a failed frame and another contact model.
+    """
     root = tmp_path_factory.mktemp("runs")
     bend = make_run("bend", frames=21)
     other = make_run("bend", frames=21)
@@ -46,8 +49,9 @@ def folders(tmp_path_factory):
     return written(root / "a", bend), written(root / "b", other, contact=contact)
 
 
-def of(found, column):
-    (one,) = [one for one in found.differences if one.column == column]
+def of(comparison, column):
+    """Return the difference of a column."""
+    (one,) = [one for one in comparison.differences if one.column == column]
     return one
 
 
@@ -63,14 +67,14 @@ def test_a_known_difference_is_found_at_its_frame(folders):
     assert of(found, "medial_area_mm2").max_abs == 0.0
 
 
-def test_what_is_not_the_same_is_said(folders):
+def test_different_settings_are_noted(folders):
     notes = " ".join(compare_folders(folders).notes)
     assert "contact, model. a: synthetic; b: hertz" in notes
     assert "b: 1 of 21 frames failed" in notes
     assert "body mass" not in notes
 
 
-def test_fewer_frames_of_one_recording_pair_without_interpolation(folders, tmp_path):
+def test_frames_of_one_recording_are_paired_without_interpolation(folders, tmp_path):
     some = chosen(make_run("bend", frames=21, maps=False), list(range(0, 21, 4)))
     found = compare_folders([folders[0], written(tmp_path / "some", some)])
     assert found.runs[1].pairing.exact
@@ -80,9 +84,9 @@ def test_fewer_frames_of_one_recording_pair_without_interpolation(folders, tmp_p
 
 
 def test_other_frames_are_interpolated_to_second_order(folders, tmp_path):
-    """The error of linear interpolation falls by four when the frames are twice as many."""
+    """Twice as many frames reduce the error of linear interpolation to a quarter."""
     errors = []
-    for frames in (38, 75):  # none of their times are those of 21 frames, but the ends
+    for frames in (38, 75):  # only the first and last frame have the times of 21 frames
         other = make_run("bend", frames=frames, maps=False)
         other.columns["time_s"] += 1.0
         found = compare_folders([folders[0], written(tmp_path / str(frames), other)])
@@ -91,8 +95,7 @@ def test_other_frames_are_interpolated_to_second_order(folders, tmp_path):
     assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.25)
 
 
-def test_the_maps_shown_are_at_a_frame_that_both_runs_have(folders, tmp_path):
-    """The largest force of those frames, not of frames that one run alone computed."""
+def test_the_shown_frame_has_the_largest_force_of_frames_with_maps_in_both_runs(folders, tmp_path):
     some = chosen(make_run("bend", frames=21), list(range(0, 17, 4)))
     kept = keep(replace(some, maps=make_run("bend", frames=21).maps), tmp_path / "part")
     force = make_run("bend", frames=21)["force_total_BW"]
@@ -102,7 +105,7 @@ def test_the_maps_shown_are_at_a_frame_that_both_runs_have(folders, tmp_path):
     assert shown_frame(found) == max(range(0, 17, 4), key=lambda k: force[k])
 
 
-def test_a_place_with_two_answers_is_not_compared(folders, tmp_path):
+def test_runs_over_a_non_monotonic_axis_are_not_compared(folders, tmp_path):
     there_and_back = make_run("bend", frames=30, maps=False)
     there_and_back.columns["time_s"] += 1.0
     there_and_back.columns["flexion_deg"][20:] = there_and_back["flexion_deg"][19:9:-1] - 0.5
@@ -111,19 +114,18 @@ def test_a_place_with_two_answers_is_not_compared(folders, tmp_path):
     assert any("does not rise or fall throughout" in note for note in found.notes)
 
 
-def test_a_mix_of_axes_is_refused_unless_one_is_chosen(folders, tmp_path, capfd):
+def test_runs_with_different_axes_are_refused_without_a_chosen_axis(folders, tmp_path, capfd):
     gait = written(tmp_path / "gait", make_run("gait", frames=21, maps=False))
     out = tmp_path / "out"
     assert main(["compare", str(folders[0]), str(gait), "--out", str(out)]) == 2
-    said = capfd.readouterr().err
-    assert "over cycle" in said and "--axis" in said and said.count("\n") == 1
+    error = capfd.readouterr().err
+    assert "over cycle" in error and "--axis" in error and error.count("\n") == 1
     assert not out.exists()
     notes = compare_folders([folders[0], gait], "cycle").notes
     assert any("The runs differ in side. a: right; gait: left" in note for note in notes)
 
 
-def test_what_each_run_released_is_said_whole_and_in_any_order(folders, tmp_path):
-    """A run that released less has not released nothing."""
+def test_released_coordinates_are_listed_completely_and_compared_in_any_order(folders, tmp_path):
 
     def notes(*released):
         bend, runs = make_run("bend", frames=21, maps=False), []
@@ -137,8 +139,7 @@ def test_what_each_run_released_is_said_whole_and_in_any_order(folders, tmp_path
     assert notes(["ap", "ml"], ["ml", "ap"]) == []
 
 
-def test_computing_times_are_no_results(tmp_path):
-    """A slower computer has not found another knee."""
+def test_computing_times_are_not_compared(tmp_path):
     runs = []
     for k in range(2):
         run = make_run("bend", frames=21, maps=False)
@@ -149,11 +150,11 @@ def test_computing_times_are_no_results(tmp_path):
     assert not [one for one in compare_folders(runs).differences if one.max_abs > 0]
 
 
-def test_the_page_stands_by_itself_and_holds_both_maps(folders, tmp_path, monkeypatch, capfd):
+def test_the_page_is_self_contained_and_has_the_chosen_frame(folders, tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(page, "QUANTITIES", page.QUANTITIES[:4])
     out = tmp_path / "out"
-    both = [str(folder) for folder in folders]
-    assert main(["compare", *both, "--frame", "10", "--out", str(out), "--json"]) == 0
+    paths = [str(folder) for folder in folders]
+    assert main(["compare", *paths, "--frame", "10", "--out", str(out), "--json"]) == 0
     printed = json.loads(capfd.readouterr().out)
     assert printed["runs"][1]["failed_frames"] == 1
     text = (out / "compare.html").read_text(encoding="utf-8")
@@ -170,15 +171,15 @@ def test_the_page_stands_by_itself_and_holds_both_maps(folders, tmp_path, monkey
         (["{a}", "{a}", "--frame", "99"], "99"),
     ],
 )
-def test_bad_input_is_one_line(folders, tmp_path, monkeypatch, capfd, arguments, words):
+def test_bad_input_gives_one_line(folders, tmp_path, monkeypatch, capfd, arguments, words):
     monkeypatch.chdir(tmp_path)
     assert main(["compare", *(word.format(a=folders[0]) for word in arguments)]) == 2
-    said = capfd.readouterr().err
-    assert words in said and said.count("\n") == 1
+    error = capfd.readouterr().err
+    assert words in error and error.count("\n") == 1
     assert not list(tmp_path.iterdir())
 
 
-def test_a_peak_at_the_edge_of_the_insert_is_said_beside_it(tmp_path):
+def test_a_peak_pressure_at_the_edge_of_the_insert_has_a_doubt(tmp_path):
     results = make_run("bend", frames=21)
     largest = peak_pressure(results)
     assert largest["doubt"] == ""
@@ -187,8 +188,8 @@ def test_a_peak_at_the_edge_of_the_insert_is_said_beside_it(tmp_path):
     edge = Results(results.columns | {"status": status}, results.summary, results.maps)
     folders = [written(tmp_path / "interior", results), written(tmp_path / "edge", edge)]
     comparison = compare_folders(folders)
-    told = comparison.as_dict()["runs"]
-    assert told[0]["peak_pressure"]["doubt"] == "" and AT_EDGE in told[1]["peak_pressure"]["doubt"]
+    runs = comparison.as_dict()["runs"]
+    assert runs[0]["peak_pressure"]["doubt"] == "" and AT_EDGE in runs[1]["peak_pressure"]["doubt"]
     lines = [line for line in page.table_lines(comparison) if "peak pressure" in line]
     assert AT_EDGE not in lines[0] and lines[1].startswith("edge: ") and AT_EDGE in lines[1]
     html = page.comparison_html(comparison).replace("\xa0", " ")

@@ -1,4 +1,4 @@
-"""The docs site: built without a warning, and loads nothing from other sites."""
+"""The documentation site: no warning in its build, and no content from other sites."""
 
 import re
 import subprocess
@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.slow
-def test_the_site_is_built_without_a_warning_and_stands_by_itself(tmp_path):
+def test_the_site_is_built_without_a_warning_and_is_self_contained(tmp_path):
     pytest.importorskip("material", reason="mkdocs-material is not installed")
     pytest.importorskip("mkdocstrings", reason="mkdocstrings is not installed")
     build = ["mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]

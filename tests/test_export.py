@@ -63,7 +63,11 @@ def test_opensim_reads_it(folder, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("run.csv", "none of .sto, .mot"), ("there.sto", "exists already"), ("no/run.sto", "no/run")],
+    [
+        ("run.csv", "does not end in .sto or .mot"),
+        ("there.sto", "exists already"),
+        ("no/run.sto", "no/run"),
+    ],
 )
 def test_a_path_that_cannot_be_written_is_refused_in_one_line(
     folder, tmp_path, capsys, name, words

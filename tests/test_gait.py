@@ -27,10 +27,10 @@ def vertical(time, stances, ramp_s=0.05, load_N=700.0):
     return force
 
 
-def test_events_lie_where_the_force_crosses_the_threshold():
+def test_gait_events_are_where_the_force_crosses_the_threshold():
     time = np.arange(0.0, 3.0, 1 / RATE_HZ)
     gait = find_gait(time, vertical(time, [(0.4, 1.05), (1.5, 2.15)]))
-    late = 0.05 * 20.0 / 700.0  # s, from the first newton to the 20 N of the threshold
+    late = 0.05 * 20.0 / 700.0  # s, time for the force to reach the threshold of 20 N
     np.testing.assert_allclose(gait.foot_strikes, [0.4 + late, 1.5 + late], atol=1e-9)
     np.testing.assert_allclose(gait.toe_offs, [1.05 - late, 2.15 - late], atol=1e-9)
     assert gait.cycle(0.3, 2.5) == pytest.approx((0.4 + late, 1.5 + late))
@@ -45,7 +45,7 @@ def test_a_recording_that_begins_on_the_plate_has_no_first_strike():
     assert gait.cycle(0.0, 2.0) is None
 
 
-def test_noise_makes_no_event():
+def test_noise_causes_no_gait_event():
     time = np.arange(0.0, 2.0, 1 / RATE_HZ)
     force = vertical(time, [(0.5, 1.2)])
     force[300:310], force[800:805] = 60.0, 0.0
@@ -53,14 +53,14 @@ def test_noise_makes_no_event():
     assert len(gait.foot_strikes) == len(gait.toe_offs) == 1
 
 
-def test_there_is_no_event_without_a_foot_or_with_one_that_never_leaves():
+def test_a_constant_force_has_no_gait_event():
     time = np.arange(0.0, 1.0, 1 / RATE_HZ)
     for load in (0.0, 500.0):
         gait = find_gait(time, np.full_like(time, load))
         assert not gait.foot_strikes + gait.toe_offs and gait.cycle(0.0, 1.0) is None
 
 
-def test_per_cent_is_counted_between_two_strikes_and_not_beyond():
+def test_per_cent_of_the_cycle_is_nan_outside_two_strikes():
     percent = cycle_percent(np.array([0.9, 1.0, 1.5, 2.0, 2.1]), (1.0, 2.0))
     np.testing.assert_allclose(percent, [np.nan, 0.0, 50.0, 100.0, np.nan])
 
@@ -79,14 +79,14 @@ def test_the_stance_is_shaded(axis, to):
     assert not [patch for patch in flexion.axes[0].patches if patch.get_gid() == "stance"]
 
 
-def test_an_import_asks_for_muscles_and_a_cycle(tmp_path, capsys):
-    """A leg that never leaves its plate shows no cycle: refused, and nothing is left behind."""
+def test_an_import_needs_a_cycle_on_the_plates_or_its_times(tmp_path, capsys):
+    """A foot that never leaves its plate gives no cycle. The import then writes no scene."""
     arguments = recorded_leg(tmp_path)
     assert main([*arguments, "--cycle", "plates"]) == 2
-    said = capsys.readouterr().err
-    assert main([*arguments, "--cycle"]) == 2  # without a word: the plates
-    assert capsys.readouterr().err == said
-    assert "--cycle plates" in said and len(said.splitlines()) == 1
+    error = capsys.readouterr().err
+    assert main([*arguments, "--cycle"]) == 2  # the default is "plates"
+    assert capsys.readouterr().err == error
+    assert "--cycle plates" in error and len(error.splitlines()) == 1
     out = Path(arguments[arguments.index("--out") + 1])
     assert not (out / "scene.toml").exists()
     assert main([*arguments, "--cycle", "0.5:1.5"]) == 0

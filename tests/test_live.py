@@ -1,4 +1,4 @@
-"""`tkamb live`: what it shows is what a run of the saved scene gives, whatever a hand does."""
+"""`tkamb live`: its numbers equal a run of the saved scene, and every input gets an answer."""
 
 import gzip
 import json
@@ -32,7 +32,7 @@ COARSE = {"contact": "foundation", "resolution_mm": 3.0}
 
 @pytest.fixture(scope="module")
 def knee():
-    """Return the shipped knee on the bench."""
+    """Return the knee of the shipped scene on the bench."""
     return LiveKnee(load_case(tkamb.load_scene(MODEL / "scene.toml")))
 
 
@@ -60,31 +60,30 @@ def assert_saved_scene_gives_the_same(knee, request, folder):
 
 
 @pytest.mark.parametrize("name", ["pressed", "heavy", "placed", "released"])
-def test_a_saved_scene_runs_to_the_same_numbers(knee, name, tmp_path):
+def test_a_run_of_a_saved_scene_gives_the_same_numbers(knee, name, tmp_path):
     assert_saved_scene_gives_the_same(knee, states(knee)[name], tmp_path / "kept")
 
 
 def test_the_load_stays_with_the_bone_when_the_insert_is_tilted(knee):
-    """On an insert with slope the part of the load along its own axis is the cosine."""
+    """The component of the load along the axis of a sloped insert is its cosine."""
     request = replace(states(knee)["pressed"], slack_percent=20.0, tibial=Placement(slope_deg=12.0))
     expected = request.load_N * np.cos(np.radians(12.0))
     assert knee.answer(request).numbers["force_si_N"] == pytest.approx(expected, rel=1e-6)
 
 
 def test_the_load_stays_with_the_bone_when_the_components_are_moved(knee):
-    """Components moved laterally: the same load line lies medial of their middle."""
+    """If both components move laterally, the line of the load lies medial of their middle."""
     request = replace(states(knee)["pressed"], slack_percent=20.0, flexion_deg=20.0)
     request = replace(request, released=("adduction",), axial_rotation_deg=0.0)
-    both = {"femoral": Placement(ml_mm=2.0), "tibial": Placement(ml_mm=2.0)}
-    before, after = (knee.answer(one).numbers for one in (request, replace(request, **both)))
+    shifted = {"femoral": Placement(ml_mm=2.0), "tibial": Placement(ml_mm=2.0)}
+    before, after = (knee.answer(one).numbers for one in (request, replace(request, **shifted)))
     total = request.load_N
     apart = before["lateral_cop_ml_mm"] - before["medial_cop_ml_mm"]
     moved = (after["medial_force_N"] - before["medial_force_N"]) / total * apart
     assert moved == pytest.approx(2.0, abs=0.1)
 
 
-def test_a_scene_of_another_make_is_saved_whole(tmp_path):
-    """A material of its own, a force at the ankle, a yield stress: the run has them all."""
+def test_a_saved_scene_keeps_material_ankle_force_and_yield_stress(tmp_path):
     changes = {
         "contact__material": None,
         "ground_reaction__applied": "ankle",
@@ -100,7 +99,7 @@ def test_a_scene_of_another_make_is_saved_whole(tmp_path):
     assert saved.yield_stress_MPa == 15.0
 
 
-def test_a_scene_of_knee_coordinates_alone_carries_the_load(tmp_path):
+def test_a_scene_with_only_knee_coordinates_carries_the_load(tmp_path):
     drop = ("tibia", "ground_reaction", "patella", "quadriceps", "patellar_ligament")
     bare = LiveKnee(load_case(tkamb.load_scene(write_scene(tmp_path / "scene", drop))))
     request = replace(bare.recorded(60), **COARSE, slack_percent=20.0)
@@ -119,7 +118,7 @@ def test_the_thickness_of_a_parametric_insert_changes_and_is_saved(tmp_path):
     thin = replace(parametric.recorded(60), **COARSE)
     thick = replace(thin, thickness_mm=thin.thickness_mm + 2.5)
     before, after = parametric.answer(thin), parametric.answer(thick)
-    # the femur rises with the dishes, and the ligaments stretch
+    # the dishes lift the femur, so the ligaments stretch
     assert 1e3 * (after.pose[1, 3] - before.pose[1, 3]) == pytest.approx(2.5, abs=0.1)
     strains = [name for name in before.numbers if name.endswith("strain_percent")]
     assert all(after.numbers[name] > before.numbers[name] for name in strains)
@@ -127,24 +126,27 @@ def test_the_thickness_of_a_parametric_insert_changes_and_is_saved(tmp_path):
 
     write_stl(tmp_path / INSERT_MESH, *replace(design.insert, dish_half=22.5).mesh())
     other = LiveKnee(load_case(case.scene))
-    assert other.design is None  # this mesh is not that of the design beside it
+    assert other.design is None  # the design beside the mesh does not reproduce it
     with pytest.raises(InputError, match="parametric"):
         other.answer(replace(thick, thickness_mm=8.0))
 
 
 @pytest.fixture(scope="module")
 def plain():
-    """Return the shipped knee as an object, and the configuration of a frame."""
+    """Return the knee of the shipped scene as an object, and the state of one frame."""
     changes = {"contact.model": "foundation", "contact.resolution_mm": 3.0}
     plain, motion, ground = tkamb.read_scene(tkamb.load_scene(MODEL / "scene.toml", changes))
     return plain, (motion.q[60], motion.v[60], motion.a[60], ground[60])
 
 
-def test_a_knee_object_is_pressed_as_its_own_call_presses_it(plain, tmp_path):
-    own, state = plain
-    bench = bench_of_knee(own, state[0])
+def test_a_knee_object_gives_the_same_numbers_as_press(plain, tmp_path):
+    plain_knee, state = plain
+    bench = bench_of_knee(plain_knee, state[0])
     request = replace(bench.recorded(0), load_N=900.0)
-    slack, pressed = bench.answer(replace(request, slack_percent=20.0)), own.press(state[0], 900.0)
+    slack, pressed = (
+        bench.answer(replace(request, slack_percent=20.0)),
+        plain_knee.press(state[0], 900.0),
+    )
     for side in ("medial", "lateral"):
         condyle = getattr(pressed, side)
         assert slack.numbers[f"{side}_force_N"] == pytest.approx(condyle.force, rel=1e-6)
@@ -154,86 +156,87 @@ def test_a_knee_object_is_pressed_as_its_own_call_presses_it(plain, tmp_path):
 
 
 def test_a_left_knee_object_is_the_mirror_image(plain, tmp_path):
-    own, state = plain
-    body = whole_body(own, True, False)
+    plain_knee, state = plain
+    body = whole_body(plain_knee, True, False)
     left = bench_of_knee(body.knee, body.state(*state)[0])
-    right = bench_of_knee(own, state[0])
+    right = bench_of_knee(plain_knee, state[0])
     request = replace(right.recorded(0), load_N=900.0, tibial=Placement(ml_mm=1.0))
     places = left.recorded(0).coordinates(), right.recorded(0).coordinates()
     assert places[0] == pytest.approx(places[1], abs=1e-9)
-    there, here = right.answer(request).numbers, left.answer(request).numbers
-    assert here == pytest.approx(there, rel=1e-5, abs=1e-5)
+    expected, numbers = right.answer(request).numbers, left.answer(request).numbers
+    assert numbers == pytest.approx(expected, rel=1e-5, abs=1e-5)
     assert left.case.scene.patient.side == "left"
     assert_saved_scene_gives_the_same(left, request, tmp_path / "kept")
 
 
 def test_a_knee_object_needs_a_contact_model_with_a_name(plain):
-    own, state = plain
-    bare = tkamb.Knee(own.model)
+    plain_knee, state = plain
+    bare = tkamb.Knee(plain_knee.model)
     with pytest.raises(InputError, match="contact"):
         bare.live(state[0])
 
-    class Nameless(type(own.contact.model)):
+    class Nameless(type(plain_knee.contact.model)):
         pass
 
-    nameless = tkamb.Knee(own.model, implant=own.implant, contact=Nameless(resolution=3e-3))
+    nameless = tkamb.Knee(
+        plain_knee.model, implant=plain_knee.implant, contact=Nameless(resolution=3e-3)
+    )
     with pytest.raises(InputError, match="Nameless"):
         nameless.live(state[0])
 
 
-def test_what_is_kept_was_computed_from_rest(knee, tmp_path):
-    """A lattice's answer depends on the state before, within its tolerance; a run's does not."""
+def test_a_saved_state_is_computed_without_an_initial_guess(knee, tmp_path):
+    """The initial guess changes the answer of a lattice within its tolerance."""
     window = LiveWindow(knee, tmp_path, 60)
     request = replace(knee.recorded(60), contact="lattice", resolution_mm=4.0)
     for flexion in (50.0, 58.0, 60.0):
         knee.answer(replace(request, flexion_deg=flexion))
-    kept = words(window.question("save", asdict(request)))
-    results = tkamb.simulate(kept["saved"], frames=slice(0, 1))
+    saved = words(window.question("save", asdict(request)))
+    results = tkamb.simulate(saved["saved"], frames=slice(0, 1))
     for name in ("force_si_N", "medial_force_N", "medial_peak_pressure_MPa", "approach_mm"):
-        assert results[name][0] == pytest.approx(kept["numbers"][name], rel=1e-9)
+        assert results[name][0] == pytest.approx(saved["numbers"][name], rel=1e-9)
 
 
 def words(packed):
-    """Return what a packed answer says beside its map."""
+    """Return the JSON object in a packed answer."""
     content = gzip.decompress(packed)
     (size,) = struct.unpack("<I", content[:4])
     return json.loads(json.loads(content[4 : 4 + size])["words"])
 
 
-def test_a_left_knee_is_saved_as_a_left_one(tmp_path):
+def test_a_left_knee_is_saved_as_a_left_knee(tmp_path):
     left = LiveKnee(load_case(tkamb.load_scene(write_mirrored_patient(tmp_path / "left"))))
     request = replace(left.recorded(60), **COARSE, ml_mm=1.0, tibial=Placement(ml_mm=0.5))
     assert_saved_scene_gives_the_same(left, request, tmp_path / "kept")
 
 
-def test_the_load_is_what_the_condyles_and_ligaments_carry(knee):
-    """Without ligaments the contact carries the axial load; with them more."""
+def test_taut_ligaments_increase_the_contact_force(knee):
+    """Without tension in the ligaments the contact force equals the axial load."""
     request = states(knee)["pressed"]
     slack = knee.answer(replace(request, slack_percent=20.0))
     assert slack.numbers["force_si_N"] == pytest.approx(request.load_N, abs=1.0)
     assert knee.answer(request).numbers["force_si_N"] > request.load_N + 10.0
 
 
-def test_moving_both_components_alike_is_no_change(knee):
-    """Femoral component and insert shifted forwards alike: ligaments alone feel it."""
+def test_the_same_shift_of_both_components_changes_no_contact_force(knee):
     request = replace(states(knee)["pressed"], slack_percent=20.0, flexion_deg=0.0)
     request = replace(request, adduction_deg=0.0, axial_rotation_deg=0.0)
-    both = {"femoral": Placement(ap_mm=3.0), "tibial": Placement(ap_mm=3.0)}
-    before, after = knee.answer(request), knee.answer(replace(request, **both))
+    shifted = {"femoral": Placement(ap_mm=3.0), "tibial": Placement(ap_mm=3.0)}
+    before, after = knee.answer(request), knee.answer(replace(request, **shifted))
     assert after.numbers["medial_force_N"] == pytest.approx(
         before.numbers["medial_force_N"], rel=1e-6
     )
 
 
-def test_an_overtaken_request_is_dropped(knee):
+def test_a_newer_request_cancels_an_older_one(knee):
     stale = knee.overtake()
     knee.overtake()
     with pytest.raises(TkambError, match="overtaken"):
         knee.answer(states(knee)["pressed"], stale)
 
 
-def test_no_hand_breaks_it(knee):
-    """Lift-off, edges, a dislocated femur, one condyle, five body weights: a status, always."""
+def test_every_random_state_has_a_status(knee):
+    """The states include lift-off, edge contact, dislocation and five body weights."""
     chance, statuses = np.random.default_rng(7), set()
     for _ in range(60):
         angles, lengths = chance.uniform(-1, 1, 3), chance.uniform(-1, 1, 2)
@@ -275,32 +278,31 @@ def test_no_hand_breaks_it(knee):
         {"released": [{}, "ap"]},
     ],
 )
-def test_a_page_cannot_ask_for_nonsense(values):
+def test_invalid_requests_of_the_page_are_refused(values):
     with pytest.raises(InputError):
         BenchRequest.read(values)
 
 
-def test_the_window_answers_its_own_page_only(knee, tmp_path):
+def test_the_window_answers_only_its_own_page(knee, tmp_path):
     server = LiveWindow(knee, tmp_path, 60).server()
-    knee.answer(states(knee)["pressed"])  # what is not prepared would have to be asked for again
+    knee.answer(states(knee)["pressed"])  # prepares the contact model
     serve_in_background(server)
     try:
         with urllib.request.urlopen(server.url, timeout=30) as page:
             assert b"live.js" not in page.read() and page.status == 200
-        question = json.dumps(asdict(states(knee)["pressed"])).encode()
-        foreign = urllib.request.Request(server.url.rsplit("/", 2)[0] + "/live", question)
+        content = json.dumps(asdict(states(knee)["pressed"])).encode()
+        foreign = urllib.request.Request(server.url.rsplit("/", 2)[0] + "/live", content)
         with pytest.raises(urllib.error.HTTPError, match="403"):
             urllib.request.urlopen(foreign, timeout=30)
         with urllib.request.urlopen(
-            urllib.request.Request(server.url + "save", question), timeout=60
+            urllib.request.Request(server.url + "save", content), timeout=60
         ) as saved:
             assert (tmp_path / "kept-1" / "scene.toml").samefile(words(saved.read())["saved"])
     finally:
         server.close()
 
 
-def test_what_nobody_foresaw_of_a_preparation_is_said_to_the_page(knee, monkeypatch, tmp_path):
-    """The thread ended with a traceback, and the page waited for ever."""
+def test_an_unexpected_error_in_a_preparation_reaches_the_page(knee, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(knee, "_side", lambda request: 1 / 0)
     request = replace(states(knee)["pressed"], resolution_mm=7.0)
@@ -308,39 +310,38 @@ def test_what_nobody_foresaw_of_a_preparation_is_said_to_the_page(knee, monkeypa
         list(iter(lambda: knee.preparing(request), ""))
 
 
-def test_only_few_models_are_prepared_at_a_time_and_the_oldest_are_dropped(monkeypatch):
-    """A setting that the page has left before a thread was free is never prepared."""
-    own = LiveKnee(load_case(tkamb.load_scene(MODEL / "scene.toml")))
+def test_few_models_are_prepared_at_a_time_and_the_oldest_are_deleted(monkeypatch):
+    bench = LiveKnee(load_case(tkamb.load_scene(MODEL / "scene.toml")))
     go_on, begun = Event(), []
 
     def slow(request):
         begun.append(request.resolution_mm)
         assert go_on.wait(60.0)
-        own._sides[setting(request)] = None
-        with own._counting:
-            own._forget()
+        bench._sides[setting(request)] = None
+        with bench._counting:
+            bench._forget()
 
-    monkeypatch.setattr(own, "_side", slow)
-    requests = [replace(own.recorded(60), resolution_mm=1.0 + 0.1 * k) for k in range(12)]
+    monkeypatch.setattr(bench, "_side", slow)
+    requests = [replace(bench.recorded(60), resolution_mm=1.0 + 0.1 * k) for k in range(12)]
     for request in requests:
-        assert own.preparing(request)
-    assert len(own._threads) == BENCH_LIMIT.most_threads == len(begun)
-    assert "then" in own.preparing(requests[-1])
+        assert bench.preparing(request)
+    assert len(bench._threads) == BENCH_LIMIT.most_threads == len(begun)
+    assert "then" in bench.preparing(requests[-1])
     go_on.set()
     for request in requests[2:]:
-        while own.preparing(request):
+        while bench.preparing(request):
             time.sleep(0.005)
-    assert not own._threads
-    assert [*own._sides] == [setting(one) for one in requests[-BENCH_LIMIT.kept_models :]]
+    assert not bench._threads
+    assert [*bench._sides] == [setting(one) for one in requests[-BENCH_LIMIT.kept_models :]]
 
 
-def test_an_insert_is_dropped_with_the_last_model_that_needs_it(knee):
-    own = LiveKnee(knee.case)
-    own._cases = dict.fromkeys((8.0, 9.0))
-    own._known = dict.fromkeys((8.0, 9.0))
-    own._sides = {("foundation", 2.0, 9.0): None}
-    own._forget()
-    assert [*own._cases] == [*own._known] == [9.0]
+def test_an_insert_is_deleted_with_the_last_model_that_needs_it(knee):
+    bench = LiveKnee(knee.case)
+    bench._cases = dict.fromkeys((8.0, 9.0))
+    bench._shared = dict.fromkeys((8.0, 9.0))
+    bench._sides = {("foundation", 2.0, 9.0): None}
+    bench._forget()
+    assert [*bench._cases] == [*bench._shared] == [9.0]
 
 
 def test_a_scene_without_contact_is_refused(tmp_path, capfd):

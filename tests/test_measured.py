@@ -1,4 +1,4 @@
-"""What was measured against what a run predicts: clock, sums, gaps, errors, every frame counted."""
+"""Comparison of measured and predicted forces: clock, sums, gaps, errors and frame counts."""
 
 import numpy as np
 import pytest
@@ -17,30 +17,30 @@ from tkamb.show.panels import panels
 POUND = 0.45359237 * 9.80665
 
 
-def read(path, at, content="time,a,b\n0,10,1\n1,20,2\n2,30,3\n3,40,4\n4,50,5\n", **changes):
+def measured_at(path, at, content="time,a,b\n0,10,1\n1,20,2\n2,30,3\n3,40,4\n4,50,5\n", **changes):
     path.write_text(content, encoding="utf-8")
     table = {"file": path, "unit": "N", "offset_s": 0.0, "columns": {"total": "a"}} | changes
     at = np.asarray(at, float)
     return load_measured_force(MeasuredTable(**table), at).at(at)
 
 
-def test_forces_are_sums_in_newton_on_the_motions_clock(tmp_path):
+def test_forces_are_summed_in_newtons_at_the_times_of_the_motion(tmp_path):
     columns = {"total": {"a": 1.0, "b": 2.0}, "medial": {"b": 3.0}}
-    found = read(tmp_path / "m.csv", [1.0, 1.75], unit="lbf", offset_s=0.5, columns=columns)
+    forces = measured_at(tmp_path / "m.csv", [1.0, 1.75], unit="lbf", offset_s=0.5, columns=columns)
     clock = np.array([0.5, 1.25])
     total, medial = (12 + 12 * clock) * POUND, 3 * (1 + clock) * POUND
-    np.testing.assert_allclose(found["total"], total)
-    np.testing.assert_allclose(found["medial"], medial)
-    np.testing.assert_allclose(found["lateral"], total - medial)
+    np.testing.assert_allclose(forces["total"], total)
+    np.testing.assert_allclose(forces["medial"], medial)
+    np.testing.assert_allclose(forces["lateral"], total - medial)
 
 
-def test_nothing_is_invented_outside_and_across_gaps(tmp_path):
+def test_forces_are_nan_in_gaps_and_outside_the_measurement(tmp_path):
     content = "time,a,\n0,1,\n1,2,\n2,,\n3,4,\n4,5,\n10,11,\n11,12,\n"
     at = [-0.1, 0.5, 1.5, 2.5, 3.5, 4.0, 7.0, 10.5, 11.1]
-    found = read(tmp_path / "m.csv", at, content)["total"]
-    known = [0.5, 3.5, 4.0, 10.5]
-    np.testing.assert_array_equal(np.isfinite(found), np.isin(at, known))
-    np.testing.assert_allclose(found[np.isfinite(found)], np.array(known) + 1)
+    force = measured_at(tmp_path / "m.csv", at, content)["total"]
+    measured = [0.5, 3.5, 4.0, 10.5]
+    np.testing.assert_array_equal(np.isfinite(force), np.isin(at, measured))
+    np.testing.assert_allclose(force[np.isfinite(force)], np.array(measured) + 1)
 
 
 @pytest.mark.parametrize(
@@ -50,9 +50,9 @@ def test_nothing_is_invented_outside_and_across_gaps(tmp_path):
         ({"columns": {"total": "A"}}, "no column 'A'"),
     ],
 )
-def test_what_cannot_be_used_is_refused(tmp_path, changes, words):
+def test_a_measurement_that_does_not_fit_is_refused(tmp_path, changes, words):
     with pytest.raises(InputError, match=words):
-        read(tmp_path / "m.csv", [0.0, 1.0], **changes)
+        measured_at(tmp_path / "m.csv", [0.0, 1.0], **changes)
 
 
 @pytest.mark.parametrize("columns", [{"time": "t"}, {"time": {"t": 1.0}, "total": "a"}])
@@ -62,7 +62,10 @@ def test_columns_that_name_no_force_are_refused(tmp_path, columns):
 
 
 def run_with_measurement(frames=40):
-    """Return a run whose prediction is 1.5 measured + 30 N; two frames failed, three unmeasured."""
+    """Return columns and summary of a run that predicts 1.5 times the measured force plus 30 N.
+
+    Two frames failed, one has no prediction, and three are not measured.
+    """
     run = make_run("gait", frames, maps=False)
     columns = {k: v for k, v in run.columns.items() if k == "status" or np.isfinite(v).any()}
     measured = 800 + 300 * np.sin(np.arange(frames) / 5)
@@ -78,12 +81,12 @@ def run_with_measurement(frames=40):
     return columns, run.summary
 
 
-def test_errors_of_a_straight_line_are_its_own():
+def test_errors_of_a_linear_prediction_have_closed_forms():
     columns, summary = run_with_measurement()
     weight = summary["body_mass_kg"] * 9.80665
-    found = compare_measured(columns, ["total"], weight)
-    assert set(found) == {"total"}
-    one, m = found["total"], columns[measured_column("total")]
+    comparison = compare_measured(columns, ["total"], weight)
+    assert set(comparison) == {"total"}
+    one, m = comparison["total"], columns[measured_column("total")]
     m = m[np.isfinite(m) & np.isfinite(columns["force_si_N"])]
     assert one["bias_N"] == pytest.approx(0.5 * m.mean() + 30)
     assert one["rmse_N"] ** 2 == pytest.approx(one["bias_N"] ** 2 + 0.25 * m.var())
@@ -94,7 +97,7 @@ def test_errors_of_a_straight_line_are_its_own():
     assert one["peak_predicted_time_s"] == one["peak_measured_time_s"]
 
 
-def test_without_contact_the_condyles_are_those_of_equilibrium():
+def test_without_contact_the_condyle_forces_by_equilibrium_are_compared():
     columns, _ = run_with_measurement()
     del columns["medial_force_N"]
     columns[measured_column("medial")] = columns["medial_force_equilibrium_N"] - 50.0
@@ -118,8 +121,7 @@ def test_every_frame_is_counted():
 
 
 @pytest.mark.parametrize("lost", ["force_si_N", measured_column("total")])
-def test_a_run_without_a_pair_says_that_nothing_is_compared(lost):
-    """Nothing predicted, or frames that lie outside the measurement."""
+def test_a_run_without_prediction_or_measurement_has_no_comparison(lost):
     columns, _ = run_with_measurement()
     columns[lost][:] = np.nan
     one = compare_measured(columns, ["total"], 700.0)["total"]
@@ -131,12 +133,12 @@ def test_a_run_without_a_pair_says_that_nothing_is_compared(lost):
     assert incomplete
 
 
-def test_the_report_shows_what_was_measured_behind_what_is_predicted():
+def test_the_report_draws_the_measured_force_behind_the_prediction():
     columns, summary = run_with_measurement()
     summary = summary | {"measured": compare_measured(columns, ["total"], 700.0)}
     results = Results(columns, summary)
-    found = {panel.name: panel for panel in panels(results)}["forces"].lines
-    behind = [line for line in found if line.behind]
+    lines = {panel.name: panel for panel in panels(results)}["forces"].lines
+    behind = [line for line in lines if line.behind]
     assert [line.name for line in behind] == ["measured_total_N"]
     card = next(c for c in cards(results, horizontal_axis(results)) if "measured" in c.title)
     assert card.warning

@@ -1,4 +1,4 @@
-"""No option is silently ignored: each one always means something, or a rule says when it does."""
+"""Every option has an effect, or a rule refuses it where it has none."""
 
 import argparse
 import shlex
@@ -48,26 +48,26 @@ ALWAYS = {
     "uncertainty": "--contact --resolution --frames --set --dask --screen",
     "cohort": "--dask --shard --frames --out --force --resume",
 }
-"""Options that mean something beside every other; those that exclude each other outright, such as
---c3d and --trc, are refused by the parser."""
+"""Options that have an effect beside all others. The parser itself refuses options that exclude
+each other, such as --c3d and --trc."""
 
 
 def options_of(parser: argparse.ArgumentParser) -> dict[str, argparse.Action]:
-    """Return every option by its long name; a positional one that may be missing by its metavar."""
-    found = {}
+    """Return long name -> option; metavar -> optional positional argument."""
+    options = {}
     for action in parser._actions:
         if isinstance(action, argparse._HelpAction):
             continue
         if action.option_strings:
-            found[next(o for o in action.option_strings if o.startswith("--"))] = action
+            options[next(o for o in action.option_strings if o.startswith("--"))] = action
         elif action.nargs == "?":
-            found[str(action.metavar)] = action
-    return found
+            options[str(action.metavar)] = action
+    return options
 
 
 @pytest.mark.parametrize("command", PARSERS)
-def test_every_option_has_a_rule_or_always_means_something(command):
-    """A new option fails here until someone says beside which others it means nothing."""
+def test_every_option_has_a_rule_or_always_has_an_effect(command):
+    """A new option needs an entry in `RULES` or in `ALWAYS`."""
     ruled = {rule.option for rule in RULES.get(command, ())}
     always = set(ALWAYS[command].split())
     assert ruled | always == ruled | set(options_of(PARSERS[command]))
@@ -75,8 +75,7 @@ def test_every_option_has_a_rule_or_always_means_something(command):
 
 
 @pytest.mark.parametrize("command", PARSERS)
-def test_every_option_is_described(command):
-    """By a sentence, or by what it takes: --load N."""
+def test_every_option_has_a_help_text(command):
     for name, action in options_of(PARSERS[command]).items():
         assert action.help, f"{command} {name}"
     for action in PARSERS[command]._actions:
@@ -84,7 +83,7 @@ def test_every_option_is_described(command):
 
 
 @pytest.mark.parametrize("command", PARSERS)
-def test_the_examples_in_the_help_can_be_typed(command, capsys):
+def test_the_examples_in_the_help_are_accepted(command, capsys):
     assert len(EXAMPLES[command]) >= 2
     for example in EXAMPLES[command]:
         words = shlex.split(example.split(" | ")[0].split(" > ")[0])
@@ -145,7 +144,7 @@ OF_IMPORT = ["--side=right", "--mass-kg=70", "--out=o"]
 
 
 def written(command: str, name: str) -> list[str]:
-    """Return an option as it is written, with some value if it takes one."""
+    """Return an option as arguments, with a value if it needs one."""
     if not name.startswith("--"):
         return ["scene.toml"]
     action = options_of(PARSERS[command])[name]
@@ -158,8 +157,8 @@ def written(command: str, name: str) -> list[str]:
 
 
 def offences() -> list[tuple[str, Rule, list[str]]]:
-    """Return every rule with a command line that breaks it and no other rule."""
-    found = []
+    """Return command, rule and a command line that breaks only this rule, for every rule."""
+    cases = []
     for command, rules in RULES.items():
         for rule in rules:
             for other in rule.excludes or ("",):
@@ -178,41 +177,39 @@ def offences() -> list[tuple[str, Rule, list[str]]]:
                     words.append("--load=5")
                 if rule.option == "--static" and other == "--poses":
                     words += ["--pose-sequence=XYZ"]
-                found.append((command, rule, words))
-    return found
+                cases.append((command, rule, words))
+    return cases
 
 
 @pytest.mark.parametrize(
     ("command", "rule", "words"),
     [pytest.param(*case, id=" ".join(case[2])[:90]) for case in offences()],
 )
-def test_an_option_that_means_nothing_is_refused(
-    tmp_path, monkeypatch, capsys, command, rule, words
-):
+def test_an_option_without_effect_is_refused(tmp_path, monkeypatch, capsys, command, rule, words):
     monkeypatch.chdir(tmp_path)
     try:
         status = main(words)
     except SystemExit as refused:
         status = refused.code
-    said = capsys.readouterr().err
-    assert status == 2 and len(said.splitlines()) == 1, said
-    assert rule.option in said and ("needs" in said or "does not go with" in said), said
+    error = capsys.readouterr().err
+    assert status == 2 and len(error.splitlines()) == 1, error
+    assert rule.option in error and ("needs" in error or "does not go with" in error), error
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("short", ["--plat=2", "--plate", "--pl"])
-def test_a_shortened_option_is_the_same_option(tmp_path, capsys, short):
+def test_rules_apply_to_abbreviated_options(tmp_path, capsys, short):
     arguments = recorded_leg(tmp_path)
     words = [short] if "=" in short else [short, "2"]
     assert main([*arguments, *words]) == 2
     assert "--plates: needs --c3d" in capsys.readouterr().err
 
 
-def test_a_value_is_not_taken_for_an_option(tmp_path):
+def test_a_value_is_not_mistaken_for_an_option(tmp_path):
     assert main([*recorded_leg(tmp_path), "--note", "forces: see the lab's --plates list"]) == 0
 
 
-def test_an_address_of_a_cluster_leaves_no_workers_to_ask_for(tmp_path, monkeypatch, capsys):
+def test_workers_are_refused_with_the_address_of_a_cluster(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["cohort", "c.toml", "--dask=tcp://host:1", "--workers=4"]) == 2
     assert "--workers: does not go with --dask" in capsys.readouterr().err
@@ -228,7 +225,7 @@ def motion_file(tmp_path, start: float, end: float) -> str:
 
 
 @pytest.mark.parametrize(("interval", "first", "last"), [("1:3", 1.0, 3.0), ("0.52:2", 0.55, 2.0)])
-def test_an_interval_of_a_motion_is_taken(tmp_path, interval, first, last):
+def test_an_interval_of_a_motion_is_imported(tmp_path, interval, first, last):
     path = motion_file(tmp_path, 0.5, 4.5)
     arguments = changed(recorded_leg(tmp_path), trc=None, motion=path, interval=interval)
     assert main(arguments) == 0
@@ -236,7 +233,7 @@ def test_an_interval_of_a_motion_is_taken(tmp_path, interval, first, last):
     assert time[[0, -1]] == pytest.approx([first, last])
 
 
-def test_motion_and_forces_are_joined_where_both_are(tmp_path, capsys):
+def test_motion_and_forces_are_imported_at_their_common_times(tmp_path, capsys):
     path = motion_file(tmp_path, 0.5, 4.5)
     clock = np.linspace(0.0, 2.5, 251)
     columns = {f"ground_force_r_{k}{a}": 0 * clock for k in "vp" for a in "xyz"}
@@ -252,8 +249,8 @@ def test_motion_and_forces_are_joined_where_both_are(tmp_path, capsys):
     assert "give files of one trial" in capsys.readouterr().err
 
 
-def test_the_rules_name_options_that_are_there():
+def test_the_rules_name_existing_options():
     for command, rules in RULES.items():
-        there = set(options_of(PARSERS[command]))
+        names = set(options_of(PARSERS[command]))
         for rule in rules:
-            assert {rule.option, *rule.needs, *rule.excludes} <= there
+            assert {rule.option, *rule.needs, *rule.excludes} <= names

@@ -1,4 +1,4 @@
-"""report.html: is self-contained, shows the numbers of the run, copes with failed frames."""
+"""report.html: a self-contained page with the numbers of the run, also with failed frames."""
 
 import json
 import re
@@ -42,7 +42,7 @@ def gait():
 
 @pytest.fixture
 def unwritten(monkeypatch):
-    """Pages whose plots are drawn but not written as SVG, which takes the time."""
+    """Replace the SVG of plots by an empty one, because writing it is slow."""
     monkeypatch.setattr("tkamb.show.report.svg_text", lambda *_: "<svg></svg>")
 
 
@@ -52,7 +52,7 @@ def page(bend):
 
 
 class Checker(HTMLParser):
-    """Collects what is not closed, ids that come twice, and references out of the page."""
+    """Parser that collects unclosed elements, repeated ids and references to other files."""
 
     def __init__(self, text):
         super().__init__()
@@ -83,12 +83,12 @@ class Checker(HTMLParser):
 
 
 @pytest.mark.parametrize("kind", ["bend", "gait"])
-def test_page_stands_by_itself(kind, request):
+def test_page_is_self_contained(kind, request):
     text = report_html(request.getfixturevalue(kind))
-    found = Checker(text)
-    assert found.open == []
-    assert found.outside == []
-    assert found.twice == []
+    checker = Checker(text)
+    assert checker.open == []
+    assert checker.outside == []
+    assert checker.twice == []
     assert "http" not in text.replace("http-equiv", "")
     assert "<h2>Muscles</h2>" not in text
     assert "@import" not in text
@@ -97,14 +97,13 @@ def test_page_stands_by_itself(kind, request):
 
 
 def test_references_inside_the_page_have_a_target(page):
-    found = Checker(page)
     targets = re.findall(r'(?:href="#|url\(#)([^")]+)', page)
     assert targets
-    assert set(targets) <= found.ids
+    assert set(targets) <= Checker(page).ids
 
 
 def curve(page, panel, line):
-    """Pixels (n, 2) of a curve and the box of its axes."""
+    """Return the pixels (n, 2) of a curve, the edges of its axes, and their range of values."""
     text = re.search(rf'id="figure-{panel}">.*?</svg>', page, re.DOTALL).group()
     box = [float(v) for v in re.search(r'data-box="([^"]+)"', text).group(1).split()]
     span = [float(v) for v in re.search(r'data-range="([^"]+)"', text).group(1).split()]
@@ -122,7 +121,7 @@ def curve(page, panel, line):
         ("condyles", "lateral_force_N", lambda r: r["lateral_force_N"] / (MASS_KG * 9.80665)),
     ],
 )
-def test_curves_are_the_columns(bend, page, panel, line, of):
+def test_curves_equal_the_columns(bend, page, panel, line, of):
     pixels, (left, right, top, bottom), (low, high) = curve(page, panel, line)
     assert len(pixels) == len(bend)
     x = low + (pixels[:, 0] - left) / (right - left) * (high - low)
@@ -135,7 +134,7 @@ def test_curves_are_the_columns(bend, page, panel, line, of):
     assert np.allclose(slope * values + offset, pixels[:, 1], atol=0.01)
 
 
-def test_curve_runs_in_time_order_and_breaks_where_a_frame_failed(gait):
+def test_curve_is_in_time_order_without_failed_frames(gait):
     by_flexion = Results(gait.columns, {**gait.summary, "axis": "flexion"}, None)
     pixels, (left, right, *_), (low, high) = curve(
         report_html(by_flexion), "forces", "force_total_BW"
@@ -147,7 +146,7 @@ def test_curve_runs_in_time_order_and_breaks_where_a_frame_failed(gait):
     assert (np.diff(x) < 0).any()
 
 
-def test_cycle_axis_is_cut_where_it_starts_anew(gait):
+def test_curves_are_interrupted_where_a_new_cycle_begins(gait):
     time = gait["time_s"]
     summary = {**gait.summary, "cycle_percent_s": [time[30], time[30] + 1.1]}
     axis = horizontal_axis(Results(gait.columns, summary, None))
@@ -159,18 +158,18 @@ def test_cycle_axis_is_cut_where_it_starts_anew(gait):
     assert np.isnan(y[30])
 
 
-def test_a_single_frame_has_a_place_on_the_cycle_axis(gait):
+def test_a_single_frame_is_at_0_per_cent_of_the_cycle(gait):
     results = Results({name: values[:1] for name, values in gait.columns.items()}, {}, None)
     assert horizontal_axis(results, "cycle").values == pytest.approx([0.0])
 
 
-def test_round_steps():
+def test_frames_of_the_table_are_at_round_steps():
     assert [round_step(v) for v in (0.09, 10, 10.1, 17, 31, 60)] == [0.1, 10, 15, 20, 50, 100]
     axis = horizontal_axis(make_run("bend", maps=False))
     assert np.allclose(axis.values[axis.stops(13)], np.arange(0, 121, 10), atol=0.6)
 
 
-def test_headline_numbers_are_those_of_the_columns(bend, gait):
+def test_headline_numbers_equal_the_columns(bend, gait):
     shown = {card.title: card for card in cards(bend, horizontal_axis(bend))}
     assert shown["Peak contact force"].value == f"{bend['force_total_BW'].max():.2f} BW"
     assert f"{bend['force_total_N'].max():.0f} N" in shown["Peak contact force"].detail
@@ -184,10 +183,10 @@ def test_headline_numbers_are_those_of_the_columns(bend, gait):
     assert "6 to be read with care" in shown["Frames computed"].detail
 
 
-def test_a_peak_at_the_edge_of_the_insert_is_said_to_be_there(bend):
+def test_the_card_states_a_peak_pressure_at_the_edge_of_the_insert(bend):
     axis = horizontal_axis(bend)
 
-    def told(flags):
+    def peak_card(flags):
         status = list(bend.status)
         status[peak.frame] = flags
         results = replace(bend, columns=bend.columns | {"status": status})
@@ -196,36 +195,35 @@ def test_a_peak_at_the_edge_of_the_insert_is_said_to_be_there(bend):
 
     peak = metrics.peak(bend, "<side>_peak_pressure_MPa")
     other = {"medial": "lateral", "lateral": "medial"}[peak.side]
-    assert "edge of the insert" not in told("ok").detail
-    assert "edge of the insert" not in told(f"the {other} {AT_EDGE} (within 2.5 mm)").detail
-    at_edge = told(f"lateral condyle lifts off; the {peak.side} {AT_EDGE} (within 2.5 mm)")
+    assert "edge of the insert" not in peak_card("ok").detail
+    assert "edge of the insert" not in peak_card(f"the {other} {AT_EDGE} (within 2.5 mm)").detail
+    at_edge = peak_card(f"lateral condyle lifts off; the {peak.side} {AT_EDGE} (within 2.5 mm)")
     assert "reaches the edge of the insert's articular surface" in at_edge.detail
     assert at_edge.warning
-    narrow = told(f"the {peak.side} {TOO_NARROW} for the cells: its peak pressure cannot")
+    narrow = peak_card(f"the {peak.side} {TOO_NARROW} for the cells: its peak pressure cannot")
     assert "the peak is not resolved" in narrow.detail and narrow.warning
 
 
-def test_the_post_s_force_and_pressure_are_told_beside_the_condyles(bend):
-    """The largest pressure on an insert may be its post's, not a condyle's."""
+def test_a_card_states_force_and_pressure_on_the_post(bend):
     force, pressure = np.zeros(len(bend)), np.full(len(bend), np.nan)
     axis, title = horizontal_axis(bend), "Peak force on the post"
 
-    def told():
+    def post_card():
         columns = bend.columns | {"post_force_N": force, "post_peak_pressure_MPa": pressure}
         (card,) = (c for c in cards(replace(bend, columns=columns), axis) if c.title == title)
         return card.value, card.detail
 
     assert title not in {card.title for card in cards(bend, axis)}
-    assert told() == ("none", "cam and post are not in contact")
+    assert post_card() == ("none", "cam and post are not in contact")
     force[80], pressure[80] = 0.5 * metrics.body_weight(bend), 32.9
-    value, detail = told()
+    value, detail = post_card()
     assert value == "0.50 BW" and f"{force[80]:.0f} N at " in detail and "32.9\u00a0MPa" in detail
 
 
-def test_where_wrapping_begins_is_told_as_well_as_the_frames_know_it(bend):
-    """The made-up quadriceps wraps beyond 75 deg, whatever frames were computed."""
+def test_the_flexion_where_wrapping_begins_is_stated_between_two_frames(bend):
+    """The quadriceps of this run wraps beyond 75 deg."""
 
-    def told(every):
+    def stated_flexions(every):
         columns = {name: values[::every] for name, values in bend.columns.items()}
         wrapped = columns["flexion_deg"][columns["quadriceps_wrap_deg"] > 0]
         summary = bend.summary | {"first_wrapping_flexion_deg": wrapped.min()}
@@ -233,31 +231,29 @@ def test_where_wrapping_begins_is_told_as_well_as_the_frames_know_it(bend):
         (card,) = [c for c in cards(run, horizontal_axis(run)) if "quadriceps" in c.title]
         return [float(number) for number in re.findall(r"([\d.]+)°", card.detail.split("wrap")[1])]
 
-    (first,) = told(1)
+    (first,) = stated_flexions(1)
     assert 75 <= first < 77
-    low, high = told(25)
+    low, high = stated_flexions(25)
     assert low <= 75 < high
 
 
-def test_why_there_is_no_band_says_what_to_do(bend):
-    """Failed poses and too few samples are mended differently."""
+def test_the_card_states_why_there_is_no_band(bend):
     frame = int(bend["force_total_BW"].argmax())
     table = {"samples": 20, "largest_failed_share": 0.15, "not_varied": [], "varied": []}
     table["causes_of_failure"] = {"no ellipse": 0.9}
 
-    def told(share):
+    def detail(share):
         lost = {f"force_total_BW_{end}": np.full(len(bend), np.nan) for end in PERCENTILES}
         bands = lost | {"failed_share": np.where(np.arange(len(bend)) == frame, share, 0.0)}
         run = replace(bend, bands=bands, summary=bend.summary | {"uncertainty": table})
         return next(c.detail for c in cards(run, horizontal_axis(run)) if "Uncertainty" in c.title)
 
-    assert "fewer than 20 samples have it, use more" in told(0.15)
-    assert "most often: no ellipse" in told(0.15)
-    assert "more than half of the samples failed" in told(0.6)
+    assert "fewer than 20 samples have it, use more" in detail(0.15)
+    assert "most often: no ellipse" in detail(0.15)
+    assert "more than half of the samples failed" in detail(0.6)
 
 
-def test_residuals_of_a_released_pose_are_none_only_where_they_are(bend):
-    """What is released needs none; a search that left some must not be said to have left none."""
+def test_residuals_of_a_released_pose_are_none_only_if_they_are_zero(bend):
 
     def shown(factor):
         contact = {"released": ["ap", "ml", "axial_rotation"]}
@@ -272,8 +268,8 @@ def test_residuals_of_a_released_pose_are_none_only_where_they_are(bend):
     assert shown(1.0).endswith("%")
 
 
-def test_an_axial_rotation_kept_as_recorded_shows_the_moment_that_keeps_it(bend):
-    """Without residual forces, too: AP and ML released, 7.6 N·m about the axis are left."""
+def test_a_recorded_axial_rotation_has_a_residual_moment(bend):
+    """AP and ML are released, so only the moment of up to 7.6 N·m remains."""
     columns = dict(bend.columns)
     for name in ("residual_ap_N", "residual_ml_N"):
         columns[name] = np.zeros(len(bend))
@@ -285,7 +281,7 @@ def test_an_axial_rotation_kept_as_recorded_shows_the_moment_that_keeps_it(bend)
     assert "residual axial moment is at most 7.6" in card.detail
 
 
-def test_several_questions_are_told_apart(bend):
+def test_several_questions_are_numbered(bend):
     def asked(*questions):
         summary = bend.summary | {"questions": list(questions)}
         (card,) = (c for c in cards(replace(bend, summary=summary), axis) if c.title == title)
@@ -307,21 +303,19 @@ def test_residuals_are_relative_to_the_superior_inferior_force(bend):
     assert f"the total would change by at most {effect.max():.1f}" in card.detail
 
 
-def test_no_band_in_newtons_is_drawn_among_shares_of_the_force(bend):
-    """The effect of the residuals' place is in per cent; its band in bands.csv is in N."""
+def test_the_plot_of_residuals_has_no_band(bend):
+    """The plot is in per cent of the force, but bands.csv is in N."""
     ends = (("p05", 10.0), ("p50", 20.0), ("p95", 30.0))
     bands = {f"residual_sensitivity_N_{end}": np.full(len(bend), n) for end, n in ends}
     (panel,) = (p for p in panels(replace(bend, bands=bands)) if p.name == "residuals")
     assert [line.name for line in panel.lines if line.band is not None] == []
 
 
-def test_the_known_error_stands_beside_pressure_and_area_in_colour_where_it_is_large(
-    bend, unwritten
-):
+def test_a_large_known_error_of_pressure_or_area_is_a_warning(bend, unwritten):
     small = {"approach": 0.3, "force": 0.2, "mean_pressure": 0.02, "peak_pressure": 0.04}
     for area, coloured in ((0.03, False), (0.11, True), (None, False)):
-        said = "not measured" if area is None else small | {"area": area, "cases": 4}
-        summary = bend.summary | {"known_error": said}
+        error = "not measured" if area is None else small | {"area": area, "cases": 4}
+        summary = bend.summary | {"known_error": error}
         results = Results(bend.columns, summary, None)
         (card,) = [c for c in cards(results, horizontal_axis(results)) if "pressure" in c.title]
         assert card.warning is coloured
@@ -332,14 +326,14 @@ def test_the_known_error_stands_beside_pressure_and_area_in_colour_where_it_is_l
         assert ('class="warning"' in report_html(results)) is coloured
 
 
-def test_moments_in_percent_of_weight_and_height(bend, gait):
+def test_a_second_axis_has_moments_in_per_cent_of_weight_and_height(bend, gait):
     (panel,) = (p for p in panels(bend) if p.name == "external")
     assert panel.second[0] == pytest.approx(100 / (MASS_KG * 9.80665 * 1.75))
     (panel,) = (p for p in panels(gait) if p.name == "external")
     assert panel.second is None
 
 
-def test_lifted_condyle_leaves_the_whole_share_to_the_other():
+def test_the_share_is_1_if_only_the_medial_condyle_is_loaded():
     run = make_run("bend", frames=5, maps=False)
     run.columns["lateral_force_N"][2] = np.nan
     run.columns["medial_force_N"][3] = run.columns["lateral_force_N"][3] = np.nan
@@ -348,20 +342,20 @@ def test_lifted_condyle_leaves_the_whole_share_to_the_other():
     assert np.isnan(share[3])
 
 
-def test_table_holds_every_ten_degrees(bend):
+def test_table_has_a_row_every_ten_degrees(bend):
     table = motion_table(bend, horizontal_axis(bend))
     assert table.headings[:2] == [("flexion", "deg"), ("total force", "BW")]
     assert np.allclose([float(row[0]) for row in table.rows], np.arange(0, 121, 10), atol=0.6)
     assert table.rows[-1][1] == f"{bend['force_total_BW'][-1]:.2f}"
 
 
-def test_flagged_frames_are_told_in_plain_words(gait):
+def test_flags_are_listed_with_their_frames(gait):
     rows = flag_rows(gait, horizontal_axis(gait))
     assert ("singular", "1", "20", "20 %") in rows
     assert ("raw filtered differ", "6", "50–55", "50 % to 55 %") in rows
 
 
-def test_reasons_that_differ_in_a_number_are_one_row():
+def test_reasons_that_differ_only_in_a_number_share_a_row():
     statuses = [
         "ok",
         "normal 21 deg from vertical; lateral condyle off",
@@ -375,7 +369,7 @@ def test_reasons_that_differ_in_a_number_are_one_row():
     ]
 
 
-def test_maps_have_one_scale_to_the_largest_pressure(bend):
+def test_maps_share_a_scale_up_to_the_largest_pressure(bend):
     axis, view = horizontal_axis(bend), top_view(bend)
     frames = mapped_frames(bend, axis)
     assert len(frames) >= 4
@@ -396,7 +390,7 @@ def test_maps_have_one_scale_to_the_largest_pressure(bend):
     ("side", "lateral_axis", "medial_is"),
     [("right", "+z", "left"), ("left", "+z", "right"), ("left", "-z", "left")],
 )
-def test_page_right_is_the_subjects_right(side, lateral_axis, medial_is):
+def test_the_right_of_the_page_is_the_subjects_right(side, lateral_axis, medial_is):
     run = make_run("bend", frames=5)
     run.summary.update(side=side, lateral_axis=lateral_axis)
     x, y = top_view(run).page_coordinates(np.array(3.0), np.array(-23.0))
@@ -417,7 +411,7 @@ def test_failed_frames_have_no_map_and_the_nearest_one_is_shown(gait):
 
 
 def without(run, *words):
-    """The run with every column whose name holds one of the words set to NaN."""
+    """Return a run without contact. Columns with one of the words in their names are NaN."""
     columns = dict(run.columns)
     for name in columns:
         if any(word in name for word in words):
@@ -434,7 +428,7 @@ def without(run, *words):
         ("_N", "_Nm", "BW", "MPa", "mm", "share", "condition", "yield", "slip", "wrap"),
     ],
 )
-def test_what_is_not_modelled_is_not_shown(bend, words):
+def test_plots_without_numbers_are_not_shown(bend, words):
     run = without(bend, *words)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -446,7 +440,7 @@ def test_what_is_not_modelled_is_not_shown(bend, words):
     assert ("pressures" in names) == ("medial" not in words and "MPa" not in words)
 
 
-def test_single_frame_and_still_motion_are_drawn():
+def test_a_single_frame_and_a_motion_at_one_flexion_are_drawn():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         one = make_run("bend", frames=5)
@@ -456,19 +450,19 @@ def test_single_frame_and_still_motion_are_drawn():
         assert Checker(report_html(Results(still, one.summary, one.maps))).open == []
 
 
-def test_words_of_the_user_cannot_break_the_page(bend, unwritten):
+def test_html_in_titles_notes_and_statuses_is_escaped(bend, unwritten):
     summary = {**bend.summary, "title": "</script><b>", "notes": ["<img src=x>"]}
     run = Results({**bend.columns, "status": ["</script>"] * len(bend)}, summary, None)
-    found = Checker(report_html(run))
-    assert found.open == []
-    assert found.outside == []
+    checker = Checker(report_html(run))
+    assert checker.open == []
+    assert checker.outside == []
 
 
-def test_report_is_the_same_each_time(bend, page):
+def test_report_is_reproducible(bend, page):
     assert report_html(bend) == page
 
 
-def test_cursor_data_are_the_columns(bend, page):
+def test_slider_data_equal_the_columns(bend, page):
     data = json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL).group(1))
     assert np.allclose(data["x"], bend["flexion_deg"], rtol=1e-4)
     assert data["panels"]["forces"]["unit"] == "BW"
@@ -477,7 +471,7 @@ def test_cursor_data_are_the_columns(bend, page):
     assert np.allclose(total["values"], bend["force_total_BW"], rtol=1e-4)
 
 
-def test_missing_mass_and_unwritable_folder_are_one_line(bend, unwritten, tmp_path):
+def test_missing_mass_and_unwritable_folder_are_refused(bend, unwritten, tmp_path):
     run = Results(bend.columns, {**bend.summary, "body_mass_kg": None}, None)
     with pytest.raises(InputError, match="body_mass_kg"):
         report_html(run)
@@ -526,7 +520,7 @@ def test_slider_moves_the_cursor_and_the_numbers(bend, page, tmp_path, chromium)
     assert browser.evaluate(joined) == "round"
 
 
-def test_a_script_that_is_not_the_report_s_own_does_not_run(page, tmp_path, chromium):
+def test_foreign_scripts_in_the_page_do_not_run(page, tmp_path, chromium):
     path = tmp_path / "report.html"
     foreign = (
         "<script>document.title = 'foreign'</script>"
@@ -537,12 +531,12 @@ def test_a_script_that_is_not_the_report_s_own_does_not_run(page, tmp_path, chro
     path.write_text(page.replace("</body>", foreign), encoding="utf-8")
     browser = Page(chromium).open(path.as_uri(), LIVE)
     assert browser.evaluate("document.title") != "foreign"
-    refused = [told for told in browser.problems if "Content Security Policy" in told]
+    refused = [line for line in browser.problems if "Content Security Policy" in line]
     assert len(refused) >= 3
 
 
 def with_bands(run):
-    """Return a run with a band of 80 to 130 % around two of its columns, median 110 %."""
+    """Return a run with bands of two columns, 80 to 130 % of the nominal values, median 110 %."""
     bands = {
         f"{name}_{end}": factor * run[name]
         for name in ("force_total_BW", "medial_peak_pressure_MPa")
@@ -559,7 +553,7 @@ def with_bands(run):
     return Results(run.columns, summary, run.maps, bands=bands)
 
 
-def test_a_plot_is_the_same_whatever_was_drawn_before_it(bend):
+def test_a_plot_does_not_depend_on_earlier_plots_of_its_sheet(bend):
     axis, shown = horizontal_axis(bend), panels(bend)
     assert {True, False} == {one.logarithmic for one in shown} and any(one.second for one in shown)
     sheet = Sheet(bend, axis)
@@ -568,16 +562,16 @@ def test_a_plot_is_the_same_whatever_was_drawn_before_it(bend):
         assert again[one.name] == svg_text(Sheet(bend, axis).draw(one), one.name)
 
 
-def test_bands_are_drawn_at_their_percentiles_and_told_in_words(bend, page):
+def test_bands_are_drawn_at_their_percentiles_and_stated_in_a_card(bend, page):
     run = with_bands(bend)
     axis = horizontal_axis(run)
-    found = "".join(
+    figures = "".join(
         f'<figure id="figure-{one.name}">{svg_text(Sheet(run, axis).draw(one), one.name)}'
         for one in panels(run)
         if one.name in ("forces", "pressures")
     )
-    forces = re.search(r'id="figure-forces">.*?</svg>', found, re.DOTALL).group()
-    values, heights = bend["force_total_BW"], curve(found, "forces", "force_total_BW")[0][:, 1]
+    forces = re.search(r'id="figure-forces">.*?</svg>', figures, re.DOTALL).group()
+    values, heights = bend["force_total_BW"], curve(figures, "forces", "force_total_BW")[0][:, 1]
     slope, offset = np.polyfit(values, heights, 1)
     median = re.search(r'id="forces-median-force_total_BW">\s*<path d="([^"]+)"', forces).group(1)
     drawn = np.array(re.findall(r"[ML] (\S+) (\S+)", median), float)[:, 1]
@@ -588,7 +582,7 @@ def test_bands_are_drawn_at_their_percentiles_and_told_in_words(bend, page):
     y = np.array(re.findall(r"[ML] \S+ (\S+)", shade.group(1)), float) + float(shade.group(2))
     assert y.min() == pytest.approx(slope * 1.3 * values.max() + offset, abs=0.01)
     assert y.max() == pytest.approx(slope * 0.8 * values.min() + offset, abs=0.01)
-    assert "-band-" in re.search(r'id="figure-pressures">.*?</svg>', found, re.DOTALL).group()
+    assert "-band-" in re.search(r'id="figure-pressures">.*?</svg>', figures, re.DOTALL).group()
     assert "-band-" not in page
     card = next(one for one in cards(run, axis) if one.title.startswith("Uncertainty of"))
     peak = values.max()
@@ -598,7 +592,9 @@ def test_bands_are_drawn_at_their_percentiles_and_told_in_words(bend, page):
     assert card.warning
 
 
-def test_units_downloads_and_the_map_of_the_slider_s_frame(bend, page, tmp_path, chromium):
+def test_units_change_and_downloads_and_map_show_the_frame_of_the_slider(
+    bend, page, tmp_path, chromium
+):
     path = tmp_path / "report.html"
     path.write_text(page, encoding="utf-8")
     browser = Page(chromium).open(path.as_uri(), LIVE)
@@ -625,7 +621,7 @@ def test_units_downloads_and_the_map_of_the_slider_s_frame(bend, page, tmp_path,
     assert {url.split(":")[0] for url in browser.requests} <= {"file", "data", "blob"}
 
 
-def test_on_paper_it_has_six_pages_at_most(page, tmp_path, chromium):
+def test_the_printed_report_has_at_most_six_pages(page, tmp_path, chromium):
     path = tmp_path / "report.html"
     path.write_text(page, encoding="utf-8")
     printed = Page(chromium).open(path.as_uri(), LIVE).pdf()
@@ -633,7 +629,7 @@ def test_on_paper_it_has_six_pages_at_most(page, tmp_path, chromium):
 
 
 def measure_labels(figure):
-    """Have labels whose places are known counted as what is drawn."""
+    """Include all tick labels in the tight bounding boxes of a figure."""
     for axes in figure.axes:
         for axis in (axes.xaxis, *(one.yaxis for one in (axes, *axes.child_axes))):
             for label in axis.get_majorticklabels():
@@ -642,8 +638,8 @@ def measure_labels(figure):
 
 @pytest.mark.parametrize("width", [WIDTH, THIRD])
 @pytest.mark.parametrize("scale", [1.0, 1e-4, 1e7])
-def test_nothing_of_a_plot_is_cut_off_and_it_fills_its_picture(bend, gait, width, scale):
-    """Long and short numbers, a level, a range, a second axis, a legend wider than the plot."""
+def test_a_plot_with_its_labels_fits_and_fills_its_figure(bend, gait, width, scale):
+    """Cases: long and short numbers, a level, a range, a second axis, a wide legend."""
     wordy = [Line(f"l{k}", f"a long name {k}", scale * np.arange(101.0), BLACK) for k in range(6)]
     drawn = [(run, panel) for run in (bend, gait) for panel in panels(run)]
     counts = (3, 4, 6) if width == WIDTH else (1, 2)
@@ -673,7 +669,7 @@ def _peak_card(run):
     return next(card for card in shown if card.title == "Peak contact pressure")
 
 
-def test_the_yielded_area_beside_the_peak_is_that_of_its_own_condyle():
+def test_the_area_above_yield_is_stated_per_condyle():
     run = make_run("bend", 11)
     side = metrics.peak(run, "<side>_peak_pressure_MPa").side
     other = "lateral" if side == "medial" else "medial"
@@ -684,7 +680,7 @@ def test_the_yielded_area_beside_the_peak_is_that_of_its_own_condyle():
     assert f"4 % of the {side} area and 31 % of the {other} area is above yield" in detail
 
 
-def test_a_known_error_is_said_to_be_that_of_the_contact_model_alone():
+def test_card_and_note_attribute_the_known_error_to_the_contact_model():
     run = make_run("bend", 11)
     run.summary["known_error"] = {
         "peak_pressure": 0.05,
@@ -697,7 +693,7 @@ def test_a_known_error_is_said_to_be_that_of_the_contact_model_alone():
     assert "error of the contact model alone" in areas.note
 
 
-def test_the_maps_show_the_frame_of_the_largest_pressure():
+def test_the_maps_include_the_frame_of_the_largest_pressure():
     run = make_run("bend", 101)
     rows = metrics.map_rows(run)
     last = max(rows)
@@ -712,7 +708,7 @@ def test_the_maps_show_the_frame_of_the_largest_pressure():
         assert ["peak pressure" in title for title in titles if title].count(True) == 1
 
 
-def test_a_curve_that_lies_on_another_is_dashed():
+def test_a_curve_that_coincides_with_another_is_dashed():
     run = make_run("bend", 11)
     run.columns["medial_slip_mm"] = np.linspace(0, 4, 11)
     run.columns["lateral_slip_mm"] = np.linspace(0, 4, 11) + 1e-3
@@ -724,7 +720,7 @@ def test_a_curve_that_lies_on_another_is_dashed():
 
 
 def test_the_outline_of_the_insert_has_no_steps():
-    """Along the straight front flank no point lies farther from its line than half a grid step."""
+    """Along the anterior edge, neighbouring columns of the grid differ by less than one row."""
     run = make_run("bend", 3)
     view = top_view(run)
     _, opacity = view.insert_picture
@@ -736,7 +732,7 @@ def test_the_outline_of_the_insert_has_no_steps():
         ]
     )
     raw = (view.grey >= 0)[:, columns // 4 - 8 : columns // 2 - 28].argmax(axis=0)
-    assert np.abs(np.diff(raw)).max() >= 2  # the map's own outline does step
+    assert np.abs(np.diff(raw)).max() >= 2  # the edge of the map has steps
     assert np.abs(np.diff(edge)).max() < 1.0
     inside = np.pad(view.grey >= 0, 8)
     assert opacity.sum() == pytest.approx(inside.sum(), rel=0.02)

@@ -1,4 +1,4 @@
-"""The report's section on muscles: what is drawn where, and that its parts sum up."""
+"""The report's section on muscles: plots of activations, forces and contributions."""
 
 from dataclasses import replace
 from itertools import combinations
@@ -30,7 +30,7 @@ def test_forces_of_the_groups_are_the_sums_of_their_muscles(run):
 
 
 @pytest.mark.parametrize("side", ["medial", "lateral"])
-def test_what_makes_a_force_sums_up_to_it(run, side):
+def test_contributions_sum_to_the_force_by_equilibrium(run, side):
     panel = next(panel for panel in muscle_panels(run) if panel.name == f"from_{side}")
     whole, *parts = panel.lines
     assert {part.label for part in parts} == {
@@ -39,22 +39,22 @@ def test_what_makes_a_force_sums_up_to_it(run, side):
     np.testing.assert_allclose(sum(part.values for part in parts), whole.values, atol=1e-9)
 
 
-def test_no_two_curves_of_a_plot_look_alike(run):
+def test_curves_of_a_plot_differ_in_colour_or_dashes(run):
     for panel in muscle_panels(run):
-        looks = [(line.colour, line.dashed) for line in panel.lines]
-        assert len(set(looks)) == len(looks), panel.name
+        styles = [(line.colour, line.dashed) for line in panel.lines]
+        assert len(set(styles)) == len(styles), panel.name
 
 
-def test_every_muscle_across_the_knee_and_every_other_channel_has_its_plot(run):
+def test_every_muscle_across_the_knee_and_every_other_channel_has_a_plot(run):
     cells = activation_cells(run)
     drawn = [name for cell in cells for name in cell.muscles]
     assert len(drawn) == len(set(drawn))
     assert set(drawn) == {*GROUPS["knee extensors"], *ACROSS, *CHANNELS}
-    both = next(cell for cell in cells if "glmed1" in cell.muscles)
-    assert both.muscles == ("glmed1", "glmed2")
+    channel = next(cell for cell in cells if "glmed1" in cell.muscles)
+    assert channel.muscles == ("glmed1", "glmed2")
 
 
-def test_the_plots_hold_activation_and_envelope(run):
+def test_the_plots_show_activation_and_envelope(run):
     figure = draw_activations(run, horizontal_axis(run))
     titles = {axes.get_title("left"): axes for axes in figure.axes if axes.get_visible()}
     medial = titles["gasmed"]
@@ -65,8 +65,7 @@ def test_the_plots_hold_activation_and_envelope(run):
     assert titles["GM (2)"].get_title("right") == "r −0.20 to 0.81"
 
 
-def test_an_envelope_that_leaves_the_plot_is_said(run):
-    """The axis of the activations ends at 1; EMG over a given value may go beyond."""
+def test_the_maximum_of_an_envelope_beyond_the_plot_is_stated(run):
     envelope = run["envelope_gasmed"]
     high = run.columns | {"envelope_gasmed": 1.5 * envelope / np.nanmax(envelope)}
     figure = draw_activations(replace(run, columns=high), horizontal_axis(run))
@@ -75,13 +74,13 @@ def test_an_envelope_that_leaves_the_plot_is_said(run):
     assert "EMG" not in titles["GM (2)"]
 
 
-def test_reserves_stand_in_words(run):
+def test_reserves_are_stated_in_a_sentence(run):
     words = reserve_words(run.summary)
     assert "hip rotation 7.2 N·m (55 %, above 5 % in 31 frames)" in words
     assert "knee flexion 1.4 N·m (4 %)" in words
 
 
-def test_the_section_is_in_the_page(run):
+def test_the_page_has_the_section_on_muscles(run):
     page = report_html(run)
     assert "<h2>Muscles</h2>" in page
     assert "figure-from_medial" in page
@@ -90,8 +89,8 @@ def test_the_section_is_in_the_page(run):
 
 @pytest.mark.parametrize("kind", ["cycle", "time"])
 @pytest.mark.parametrize("count", [3, 5, 13, 15])
-def test_small_plots_stand_apart_and_within_their_picture(run, kind, count):
-    """With all labels, also over an empty place in the last row; nothing is left unused."""
+def test_small_plots_fill_their_figure_without_overlap(run, kind, count):
+    """The bounding boxes include all labels, also above an incomplete last row."""
     groups = {"knee extensors": [*GROUPS["knee extensors"], *ACROSS, *CHANNELS][:count]}
     summary = run.summary | {"muscle_groups": groups, "emg": None}
     shown = replace(run, summary=summary)

@@ -1,4 +1,4 @@
-"""What a reader sees of a report: colours told apart, words that follow the run, smooth maps."""
+"""Legibility of a report: distinguishable colours, conclusions of the run, smooth maps."""
 
 import re
 from itertools import combinations
@@ -33,7 +33,7 @@ def gait():
     return make_run("gait", maps=False)
 
 
-def test_a_grid_over_the_insert_is_linear_between_its_points_and_ends_at_its_rim():
+def test_a_grid_over_the_insert_interpolates_linearly_and_ends_at_its_edge():
     points = np.array([[0.0, 0, 0], [0.01, 0, 0], [0.01, 0, 0.01], [0, 0, 0.01]])
     triangles = np.array([[0, 1, 2], [0, 2, 3]])
     grid = PageGrid(points, triangles, -1.0, 1.0)
@@ -43,24 +43,24 @@ def test_a_grid_over_the_insert_is_linear_between_its_points_and_ends_at_its_rim
     inside = (x > 0.1) & (x < 9.9) & (z < -0.1) & (z > -9.9)
     assert over[inside].all()
     np.testing.assert_allclose(values[over], (0.2 * x + 0.3 * z)[over] + 5.0, atol=1e-9)
-    outside = np.array([0.0, 0, np.inf, np.inf])  # nothing lies above: still one map
+    outside = np.array([0.0, 0, np.inf, np.inf])  # infinite gap: the femur is not above
     level = pressure_levels(np.array([[2.0, 2, 0, 0]]), outside[None], triangles, 4.0)[0]
     assert list(level) == [0.5, 0.5, -0.5, -0.5]
 
 
-def test_of_what_lies_over_each_other_the_grid_shows_the_highest():
-    """A ledge over a floor, a wall between them, seen from above; coarse and fine triangles."""
+def test_the_grid_shows_the_highest_of_overlapping_triangles():
+    """A ledge lies above a floor, with a vertical wall between them."""
     ledge = np.array([[0.0, 2e-3, 0], [0.004, 2e-3, 0], [0.004, 2e-3, 0.01], [0, 2e-3, 0.01]])
     floor = ledge * [2.5, 0, 1]
     triangles = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7], [1, 2, 6], [1, 6, 5]])
     points = np.concatenate([floor, ledge])[[4, 5, 6, 7, 0, 1, 2, 3]]
     grid = PageGrid(points, np.concatenate([triangles[2:4], triangles[:2]]), 1.0, 1.0)
     x = np.meshgrid(grid.up, grid.across, indexing="ij")[0]
-    seen = grid.sample(points[:, 1] * 1e3)
-    assert (seen[x <= 4.0] == pytest.approx(2.0)) and (seen[x > 4.5] == pytest.approx(0.0))
+    height = grid.sample(points[:, 1] * 1e3)
+    assert (height[x <= 4.0] == pytest.approx(2.0)) and (height[x > 4.5] == pytest.approx(0.0))
 
 
-def test_the_in_vivo_peaks_of_the_activity_lie_behind_the_force(bend):
+def test_the_in_vivo_peaks_of_the_activity_are_shaded_behind_the_force(bend):
     assert set(PEAKS_BW) == set(get_args(Activity))
     (plain,) = (one for one in panels(bend) if one.name == "forces")
     assert plain.span is None
@@ -79,7 +79,7 @@ def linear_rgb(colour):
 
 
 def contrast(colour, ground="#ffffff"):
-    """WCAG 2.1's contrast ratio."""
+    """Return the contrast ratio of WCAG 2.1."""
     low, high = sorted(float(linear_rgb(c) @ [0.2126, 0.7152, 0.0722]) for c in (colour, ground))
     return (high + 0.05) / (low + 0.05)
 
@@ -101,7 +101,7 @@ VISIONS = {
 
 
 def lab(rgb):
-    """CIELAB of linear sRGB."""
+    """Return CIELAB coordinates of a linear sRGB colour."""
     to_xyz = [
         [0.4124564, 0.3575761, 0.1804375],
         [0.2126729, 0.7151522, 0.0721750],
@@ -113,8 +113,8 @@ def lab(rgb):
 
 
 @pytest.mark.parametrize("vision", VISIONS)
-def test_colours_that_meet_in_a_plot_are_told_apart(vision):
-    """Twenty units of CIELAB are as much as two greys of which one is half as bright."""
+def test_colours_of_a_plot_can_be_distinguished(vision):
+    """Two greys, one half as bright as the other, differ by about 20 units of CIELAB."""
     together = (
         (style.MEDIAL, style.LATERAL, style.BLACK),
         (style.SUPERIOR, style.ANTERIOR, style.RIGHT, style.BLACK),
@@ -123,11 +123,11 @@ def test_colours_that_meet_in_a_plot_are_told_apart(vision):
     )
     for group in together:
         assert all(contrast(colour) >= 3.0 for colour in group)
-        seen = [lab(np.array(VISIONS[vision]) @ linear_rgb(colour)) for colour in group]
-        assert min(np.linalg.norm(a - b) for a, b in combinations(seen, 2)) > 20.0
+        perceived = [lab(np.array(VISIONS[vision]) @ linear_rgb(colour)) for colour in group]
+        assert min(np.linalg.norm(a - b) for a, b in combinations(perceived, 2)) > 20.0
 
 
-def test_text_stands_out_from_its_ground():
+def test_text_has_enough_contrast_with_the_page():
     css = asset("tkamb.show", "report.css")
     bright, dark = (
         dict(re.findall(r"--(\w+): (#\w+)", block))
@@ -139,7 +139,7 @@ def test_text_stands_out_from_its_ground():
     assert contrast(style.GREY) >= 4.5
 
 
-def test_one_colour_has_one_meaning_over_all_plots(bend):
+def test_a_colour_has_the_same_meaning_in_all_plots(bend):
     meanings = {}
     for panel in panels(bend):
         if panel.name != "ligaments":
@@ -167,10 +167,10 @@ def test_an_arrow_has_the_colour_of_its_curve(bend):
     assert len(set(drawn.values())) == len(drawn)
 
 
-def test_what_may_be_concluded_follows_the_run(bend, gait):
-    bears, bears_not = conclusions(bend)
-    assert any("only the quadriceps acts" in words for words in bears)
-    assert any("no input was varied" in words for words in bears_not)
+def test_conclusions_depend_on_the_run(bend, gait):
+    supported, unsupported = conclusions(bend)
+    assert any("only the quadriceps acts" in words for words in supported)
+    assert any("no input was varied" in words for words in unsupported)
     assert any("Results in 1 of 101 frames" in words for words in conclusions(gait)[1])
     one = {"rmse_BW": 0.3, "r_squared": 0.8, "frames_compared": 9}
     summary = bend.summary | {
@@ -179,17 +179,16 @@ def test_what_may_be_concluded_follows_the_run(bend, gait):
         "known_error": "not measured",
         "uncertainty": {"samples": 9},
     }
-    bears, bears_not = conclusions(Results(bend.columns, summary, None))
-    assert any("total 0.30 BW, lateral 0.32 BW" in words for words in bears)
-    assert not any("Which condyle" in words for words in bears)
-    assert bears_not[0].startswith("Any conclusion, before the question")
-    assert any("lateral force: the mean of the measurement" in words for words in bears_not)
-    assert any("their error is not measured" in words for words in bears_not)
-    assert not any("no input was varied" in words for words in bears_not)
+    supported, unsupported = conclusions(Results(bend.columns, summary, None))
+    assert any("total 0.30 BW, lateral 0.32 BW" in words for words in supported)
+    assert not any("Which condyle" in words for words in supported)
+    assert unsupported[0].startswith("Any conclusion, before the question")
+    assert any("lateral force: the mean of the measurement" in words for words in unsupported)
+    assert any("their error is not measured" in words for words in unsupported)
+    assert not any("no input was varied" in words for words in unsupported)
 
 
-def test_a_contact_s_rim_covers_of_each_grid_cell_what_lies_within():
-    """A round contact of 4 mm: its opacity sums up to its area, which hard steps miss."""
+def test_the_opacity_of_a_round_contact_sums_to_its_area():
     size, step = 12.0, 0.5
     z, x = np.meshgrid(np.arange(-size, size + step, step), np.arange(-size, size + step, step))
     n, across = x.size, x.shape[1]

@@ -1,4 +1,4 @@
-"""Figures as SVG: written as matplotlib writes them, shared parts once."""
+"""Figures as SVG: they equal matplotlib's, and repeated pictures are stored once."""
 
 import base64
 import io
@@ -24,18 +24,17 @@ def labelled_figure(size):
 
 
 @pytest.mark.parametrize("size", [7.0, 12.0])
-def test_texts_measured_once_stand_where_matplotlib_puts_them(size):
-    own = io.StringIO()
+def test_texts_have_the_same_positions_as_in_matplotlib(size):
+    expected = io.StringIO()
     with settings():
-        found = written(labelled_figure(size), 150)
+        text = written(labelled_figure(size), 150)
         figure = labelled_figure(size)
         figure.set_dpi(150)
-        FigureCanvasSVG(figure).print_svg(own, metadata={"Date": None, "Creator": None})
-    assert found == own.getvalue()
+        FigureCanvasSVG(figure).print_svg(expected, metadata={"Date": None, "Creator": None})
+    assert text == expected.getvalue()
 
 
-def test_a_picture_of_points_stands_once_and_as_it_is():
-    """The page smooths it; the second time it is drawn it is the first one, at its own place."""
+def test_a_repeated_picture_is_stored_once_in_its_own_resolution():
     colours = np.random.default_rng(1).integers(0, 255, (5, 7, 4), np.uint8)
     greys = np.repeat(colours[..., :1], 4, axis=2)
     with settings():

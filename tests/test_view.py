@@ -1,4 +1,4 @@
-"""What is drawn of a run, and the viewer's manners at its edges; no browser is needed."""
+"""Drawings of a run, the viewer's server and its command; no browser is needed."""
 
 import http.client
 import json
@@ -48,7 +48,7 @@ def server(show):
 
 
 def ask(server, method, path, body=None, below=None, **headers):
-    """Ask for a path below the token, or below another root."""
+    """Return status and content of a request for a path below the token or another root."""
     response = answer(server, method, path, body, below, **headers)
     return response.status, response.read()
 
@@ -68,29 +68,29 @@ def sphere(rings=60):
     return Surface(np.asarray(ball.vertices), np.asarray(ball.faces, np.int64), "ball")
 
 
-def test_where_condyles_touch_is_read_from_the_run_or_looked_for(folder, tmp_path):
-    """A contact.h5 of an earlier release does not have it: the drawing is the same."""
+def test_contact_points_are_read_from_the_run_or_computed_again(folder, tmp_path):
+    """A contact.h5 of an earlier release has no contact points. The drawing is the same."""
     old = tmp_path / "old"
     shutil.copytree(folder, old)
     with h5py.File(old / "contact.h5", "r+") as file:
         assert file["contact_points_m"].shape == (len(file["time_s"]), 3, 3)
         assert np.isfinite(file["contact_points_m"][()]).all()
         del file["contact_points_m"], file["contact_normals"]
-    read, looked_for = open_run(folder), open_run(folder)
-    object.__setattr__(looked_for.results, "maps", ContactMaps(old / "contact.h5"))
-    for one, other in zip(read.geometries(), looked_for.geometries(), strict=True):
+    read, computed = open_run(folder), open_run(folder)
+    object.__setattr__(computed.results, "maps", ContactMaps(old / "contact.h5"))
+    for one, other in zip(read.geometries(), computed.geometries(), strict=True):
         assert one.condyles.keys() == other.condyles.keys() == {"medial", "lateral"}
         for side, contact in one.condyles.items():
             np.testing.assert_allclose(contact.point, other.condyles[side].point, atol=1e-12)
             direction = contact.direction(0.05)
             np.testing.assert_allclose(direction, other.condyles[side].direction(0.05), atol=1e-12)
         for part in ("contact_point", "contact_normal"):
-            found = [getattr(geometry.extensor, part) for geometry in (one, other)]
-            np.testing.assert_allclose(*found, atol=1e-12)
+            parts = [getattr(geometry.extensor, part) for geometry in (one, other)]
+            np.testing.assert_allclose(*parts, atol=1e-12)
         np.testing.assert_array_equal(one.state.pose("patella"), other.state.pose("patella"))
 
 
-def test_a_wrapped_tendon_lies_on_its_outline_and_says_so(show):
+def test_the_wrapped_part_of_a_tendon_has_another_colour(show):
     quadriceps = next(one for one in show.drawings[0].strands if one.name == "quadriceps")
     wrap = show.runs[0].results["quadriceps_wrap_deg"]
     for frame, degrees in enumerate(wrap):
@@ -103,29 +103,29 @@ def test_strands_are_as_long_as_their_lines(show):
     for row, frame in enumerate(run.frames):
         state = run.mechanics.frame(frame).geometry.state
         for path in run.mechanics.extensor.lines.paths(state):
-            found = [
+            lengths = [
                 np.linalg.norm(np.diff(one.points[row], axis=0), axis=1).sum()
                 for one in drawing.strands
                 if one.layer == "extensor lines"
             ]
-            assert min(abs(length - path.length) for length in found) < 1e-9
+            assert min(abs(length - path.length) for length in lengths) < 1e-9
 
 
-def test_levels_are_the_pressures_and_change_sign_at_the_rim():
+def test_levels_are_proportional_to_pressure_and_negative_outside_the_contact():
     points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [0, 0, 1], [1, 0, 1]])
     triangles = np.array([[0, 1, 4], [1, 2, 5], [1, 5, 4]])
     pressure = np.array([[4.0, 2.0, 0, 0, 0, 0]])
     gap = np.array([[0.0, 0, 3e-5, 1e-4, 1e-5, 2e-5]])
-    found = map_levels(PressureMap(points, triangles, pressure, gap), 4.0)[0]
-    assert list(found[:2]) == [
+    level = map_levels(PressureMap(points, triangles, pressure, gap), 4.0)[0]
+    assert list(level[:2]) == [
         VIEW_PAYLOAD.pressure_levels,
         round(VIEW_PAYLOAD.pressure_levels / 2),
     ]
-    assert (found[2:] < 0).all()
-    assert found[2] < found[5] < found[4]
+    assert (level[2:] < 0).all()
+    assert level[2] < level[5] < level[4]
 
 
-def test_a_slack_tendon_is_grey_and_a_taut_one_red_where_it_is_free():
+def test_a_slack_tendon_is_grey_and_the_free_part_of_a_taut_one_is_red():
     path = TautPath(np.array([[0.0, 0, 0], [1, 0, 0]]), 1.0, 0.0)
     strand = _tendon("quadriceps", [path, path], np.array([True, False]))
     assert (strand.colours[0] == rgb(SLACK)).all()
@@ -133,13 +133,13 @@ def test_a_slack_tendon_is_grey_and_a_taut_one_red_where_it_is_free():
 
 
 def test_a_failed_frame_shows_no_pressure():
-    nothing = np.full((1, 3), np.nan)
-    found = map_levels(PressureMap(np.eye(3), np.array([[0, 1, 2]]), nothing, nothing), 10.0)
-    assert (found < 0).all()
+    missing = np.full((1, 3), np.nan)
+    level = map_levels(PressureMap(np.eye(3), np.array([[0, 1, 2]]), missing, missing), 10.0)
+    assert (level < 0).all()
 
 
-def test_a_failed_frame_sets_no_strain_scale(folder):
-    """Its pose may tear a ligament in two; the other frames' strains were one colour then."""
+def test_a_failed_frame_does_not_affect_the_strain_scale(folder):
+    """The pose of a failed frame may have very large strains."""
     run = open_run(folder)
     states = [one.state for one in run.geometries()]
     strands, limit = ligament_strands(run.mechanics, states, run.results)
@@ -155,12 +155,12 @@ def test_a_failed_frame_sets_no_strain_scale(folder):
     columns = dict(run.results.columns)
     columns["status"] = ["failed: x" if k == worst else "ok" for k in range(len(states))]
     strands, limit = ligament_strands(run.mechanics, states, replace(run.results, columns=columns))
-    left = [np.max(np.delete(one, worst)) for one in strains.values()]
-    assert limit == pytest.approx(max(left))
+    largest = [np.max(np.delete(one, worst)) for one in strains.values()]
+    assert limit == pytest.approx(max(largest))
     assert all((strand.colours[worst] == rgb(SLACK)).all() for strand in strands)
 
 
-def test_shading_keeps_every_triangle_and_doubles_sharp_edges():
+def test_shading_keeps_every_triangle_and_repeats_vertices_on_sharp_edges():
     import trimesh
 
     box = trimesh.creation.box((0.02, 0.02, 0.02))
@@ -209,11 +209,11 @@ def test_an_address_without_the_token_is_refused(server, below):
     assert ask(server, "GET", "/", below=below)[0] == 403
     assert ask(server, "GET", "/scene.bin", below=below)[0] == 403
     body = json.dumps({"frame": 0, "model": "hertz"})
-    status, told = ask(server, "POST", "/contact", body, below=below)
-    assert status == 403 and token.encode() not in told
+    status, content = ask(server, "POST", "/contact", body, below=below)
+    assert status == 403 and token.encode() not in content
 
 
-def test_each_window_has_its_own_token(show, server):
+def test_each_window_has_another_token(show, server):
     other = show.server()
     assert other.url.split("/")[3] != server.url.split("/")[3]
     serve_in_background(other)
@@ -221,7 +221,7 @@ def test_each_window_has_its_own_token(show, server):
 
 
 @pytest.mark.parametrize("path", ["/", "/scene.bin", "/nothing"])
-def test_no_other_page_may_frame_the_window(server, path):
+def test_other_pages_may_not_embed_the_window(server, path):
     headers = answer(server, "GET", path).headers
     assert "frame-ancestors 'none'" in headers["Content-Security-Policy"]
     assert headers["X-Frame-Options"] == "DENY"
@@ -240,29 +240,28 @@ def test_no_other_page_may_frame_the_window(server, path):
         "GET {} x x",
     ],
 )
-def test_what_the_library_refuses_has_the_headers_of_all_answers(server, line):
-    """Without a version the answer was bare content, as HTTP/0.9 has it."""
+def test_refused_request_lines_get_an_answer_with_all_headers(server, line):
     where, own, _ = server.url.removeprefix("http://").split("/")
     host, port = where.split(":")
     with socket.create_connection((host, int(port)), timeout=60) as client:
         client.sendall(f"{line.format(f'/{own}/')}\r\nHost: {where}\r\n\r\n".encode())
-        told = b"".join(iter(lambda: client.recv(4096), b""))
-    head, _, body = told.partition(b"\r\n\r\n")
+        content = b"".join(iter(lambda: client.recv(4096), b""))
+    head, _, body = content.partition(b"\r\n\r\n")
     assert head.startswith((b"HTTP/1.0 4", b"HTTP/1.0 5")) and b"nosniff" in head
     assert b"<" not in body and b"\n" not in body
 
 
-def test_a_client_that_says_nothing_is_cut_off(server, monkeypatch):
+def test_the_connection_of_a_silent_client_is_closed(server, monkeypatch):
     handler = server._server.RequestHandlerClass
     monkeypatch.setattr(handler, "timeout", 0.2)
     where, own, _ = server.url.removeprefix("http://").split("/")
     host, port = where.split(":")
-    question = f"POST /{own}/contact HTTP/1.1\r\nHost: {where}\r\nContent-Length: 50\r\n\r\n{{"
-    for sent, heard in ((b"", b""), (b"GET /", b""), (question.encode(), b" 408 ")):
+    request = f"POST /{own}/contact HTTP/1.1\r\nHost: {where}\r\nContent-Length: 50\r\n\r\n{{"
+    for sent, expected in ((b"", b""), (b"GET /", b""), (request.encode(), b" 408 ")):
         with socket.create_connection((host, int(port)), timeout=60) as client:
             client.sendall(sent)
-            told = b"".join(iter(lambda: client.recv(4096), b""))
-        assert heard in told and bool(heard) == bool(told)
+            content = b"".join(iter(lambda: client.recv(4096), b""))
+        assert expected in content and bool(expected) == bool(content)
     assert ask(server, "GET", "/")[0] == 200
 
 
@@ -284,13 +283,12 @@ def test_a_client_that_says_nothing_is_cut_off(server, monkeypatch):
         (b'{"frame": 0, "model": "\\ud800"}', "ud800"),
     ],
 )
-def test_a_bad_question_gets_one_line(server, body, word):
+def test_a_bad_request_gets_one_line(server, body, word):
     status, answer = ask(server, "POST", "/contact", body)
     assert status == 400 and word in answer.decode() and b"\n" not in answer
 
 
-def test_a_run_with_set_is_seen_as_it_was_run_and_the_advice_names_its_keys(tmp_path, capsys):
-    """The scene was read without --set: refused, with advice that led to another run."""
+def test_a_run_with_set_is_shown_with_its_keys_and_the_hint_repeats_them(tmp_path, capsys):
     scene, out = copied_scene(tmp_path / "knee"), tmp_path / "out"
     given = {"motion.frames": 11, "patient.mass_kg": 80.5, "contact.released": ["ap"]}
     words = [word for k, v in given.items() for word in ("--set", f"{k}={json.dumps(v)}")]
@@ -336,11 +334,11 @@ def test_results_of_a_changed_mesh_are_refused(tmp_path, capsys):
     assert not (tmp_path / "x.html").exists()
 
 
-def test_without_a_browser_one_line_says_so(folder, monkeypatch, tmp_path, capsys):
+def test_a_missing_browser_is_reported_in_one_line(folder, monkeypatch, tmp_path, capsys):
     monkeypatch.setenv("PATH", "")
     assert main(["view", str(folder), "--png", str(tmp_path / "x.png")]) == 1
-    told = capsys.readouterr().err.strip().splitlines()
-    assert "no browser found" in told[-1] and "Traceback" not in "".join(told)
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert "no browser found" in lines[-1] and "Traceback" not in "".join(lines)
 
 
 @pytest.mark.parametrize(
@@ -356,7 +354,7 @@ def test_without_a_browser_one_line_says_so(folder, monkeypatch, tmp_path, capsy
         (["--png", "/no/such/folder/x.png"], "cannot be written"),
     ],
 )
-def test_bad_options_are_one_line_before_anything_is_drawn(
+def test_bad_options_are_refused_before_anything_is_drawn(
     folder, tmp_path, capsys, monkeypatch, options, word
 ):
     monkeypatch.setattr("tkamb.show.view.run.match_frames", None)
@@ -379,7 +377,7 @@ def test_a_scene_that_is_run_for_the_viewer_is_read_once(folder, tmp_path, monke
         run.append(case)
         return results
 
-    monkeypatch.chdir(tmp_path)  # no results of the scene stand there
+    monkeypatch.chdir(tmp_path)  # this folder has no results of the scene
     for module in ("tkamb.show.view.run", "tkamb.run.simulation"):
         monkeypatch.setattr(f"{module}.load_case", counted)
     monkeypatch.setattr("tkamb.show.view.run.simulate", simulated)
@@ -389,18 +387,18 @@ def test_a_scene_that_is_run_for_the_viewer_is_read_once(folder, tmp_path, monke
     assert len(read) == 1 and run == read
 
 
-def test_what_was_written_is_said(folder, tmp_path, capsys):
+def test_the_command_prints_the_written_file(folder, tmp_path, capsys):
     page = tmp_path / "knee.html"
     assert main(["view", str(folder), "--html", str(page)]) == 0
     assert capsys.readouterr().out == f"page: {page}\n"
 
 
-def test_a_missing_folder_is_one_line(tmp_path, capsys):
+def test_a_folder_without_results_is_refused(tmp_path, capsys):
     assert main(["view", str(tmp_path)]) == 2
     assert "results.csv" in capsys.readouterr().err
 
 
-def test_the_browser_is_asked_for_only_when_needed(show, tmp_path, monkeypatch):
+def test_only_a_picture_needs_a_browser(show, tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", "")
     show.write_html(tmp_path / "knee.html")
     assert (tmp_path / "knee.html").stat().st_size < 25e6
@@ -410,7 +408,7 @@ def test_the_browser_is_asked_for_only_when_needed(show, tmp_path, monkeypatch):
         Show(show.runs, frame=77)
 
 
-def test_a_left_knee_is_mirrored_back(show):
+def test_a_left_knee_is_mirrored_by_the_transform_of_the_page(show):
     right, left = (
         np.reshape(command.lower()["matrix"], (4, 4)).T
         for command in (_insert_transform("/tkamb/0", side) for side in ("right", "left"))
@@ -422,7 +420,7 @@ def test_a_left_knee_is_mirrored_back(show):
     np.testing.assert_allclose(left @ lateral, -(right @ lateral))
 
 
-def test_a_coupled_run_is_drawn_where_its_forces_act(tmp_path):
+def test_arrows_of_a_coupled_run_add_up_to_its_contact_force(tmp_path):
     scene = copied_scene(tmp_path / "knee")
     text = scene.read_text().replace(
         'model = "foundation"', 'model = "foundation"\ncoupling = "points"'
@@ -438,7 +436,7 @@ def test_a_coupled_run_is_drawn_where_its_forces_act(tmp_path):
     np.testing.assert_allclose(pressed, given, atol=1e-3 * np.abs(given).max())
 
 
-def test_the_cameras_of_the_command_line_are_the_pages():
+def test_command_line_and_page_have_the_same_cameras():
     text = files("tkamb.show.view").joinpath("assets", "controls.js").read_text(encoding="utf-8")
     block = text.split("const CAMERAS = {")[1].split("\n};")[0]
     assert tuple(re.findall(r'^  "([^"]+)":', block, re.MULTILINE)) == CAMERAS

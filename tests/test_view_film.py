@@ -1,4 +1,4 @@
-"""Films of a run: what is refused, the colours of a GIF, every frame once."""
+"""Films of a run: refused requests, colours of a GIF, number of frames."""
 
 import io
 import shutil
@@ -15,7 +15,7 @@ from tkamb.show.view.show import Show
 from viewed import shipped_run
 
 
-def test_what_cannot_be_filmed_is_one_line(tmp_path, monkeypatch):
+def test_a_film_needs_its_suffix_and_a_browser(tmp_path, monkeypatch):
     with pytest.raises(InputError, match=r"'a.mp4' does not end with .gif"):
         film.check_film(tmp_path / "a.mp4", "--gif")
     monkeypatch.setattr(shutil, "which", lambda name: None)
@@ -24,7 +24,7 @@ def test_what_cannot_be_filmed_is_one_line(tmp_path, monkeypatch):
 
 
 def test_a_gif_keeps_the_colours_of_the_scales(tmp_path):
-    """A strip of viridis on much grey: by frequency it would be off by 36 of 255 and more."""
+    """A choice of colours by frequency would change this strip of viridis by 36 of 255."""
     grey = np.linspace(225, 255, 400).repeat(300).reshape(400, 300)
     picture = np.repeat(grey[..., None], 3, axis=2).astype(np.uint8)
     strip = (255 * colormaps["viridis"](np.linspace(0, 1, 256))[:, :3]).astype(np.uint8)

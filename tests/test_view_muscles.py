@@ -1,4 +1,4 @@
-"""Muscles in the viewer: where their lines run, and what their colours say."""
+"""Muscles in the viewer: their lines and colours."""
 
 from dataclasses import replace
 
@@ -18,8 +18,8 @@ def frames():
     ground = PointForces("tibia", np.array([[0.06, -0.45, 0.0]]), 700 * UP[None])
     knee = replace(bent_knee(), ground=ground)
     active, _ = SharedMuscles(two_flexors(1, least=0.0)).frame(0).solve(knee, 0.05)
-    nothing = 0.0 * active.share.force
-    slack = replace(active, share=replace(active.share, force=nothing, activation=nothing))
+    zero = 0.0 * active.share.force
+    slack = replace(active, share=replace(active.share, force=zero, activation=zero))
     return [
         active,
         slack,
@@ -27,22 +27,22 @@ def frames():
     ]
 
 
-def test_lines_run_between_shank_and_thigh_and_vanish_without_a_solution():
-    found = frames()
-    strands, _ = muscle_strands(found)
+def test_lines_connect_shank_and_thigh_and_are_nan_without_a_solution():
+    geometries = frames()
+    strands, _ = muscle_strands(geometries)
     assert [strand.name for strand in strands] == ["hamstring", "gastrocnemius"]
     for k, strand in enumerate(strands):
         assert strand.layer == "muscles"
-        start = transform(found[0].state.pose("tibia"), SHANK[k])
-        end = transform(found[0].state.pose("femur"), THIGH[k])
+        start = transform(geometries[0].state.pose("tibia"), SHANK[k])
+        end = transform(geometries[0].state.pose("femur"), THIGH[k])
         np.testing.assert_allclose(strand.points[:2], [[start, end]] * 2)
         assert np.isnan(strand.points[2]).all()
 
 
-def test_colours_rise_with_the_activation_and_slack_ones_are_grey():
-    found = frames()
-    strands, limit = muscle_strands(found)
-    share = found[0].share
+def test_colours_follow_the_activation_and_slack_muscles_are_grey():
+    geometries = frames()
+    strands, limit = muscle_strands(geometries)
+    share = geometries[0].share
     assert share.force[1:].min() > VIEW_STRAND.slack_force
     assert limit == max(share.activation[1:].max(), VIEW_STRAND.least_activation)
     for strand, activation in zip(strands, share.activation[1:], strict=True):
@@ -51,15 +51,15 @@ def test_colours_rise_with_the_activation_and_slack_ones_are_grey():
         np.testing.assert_array_equal(strand.colours[1], [rgb(SLACK)] * 2)
 
 
-def test_the_scale_shares_no_colour_with_the_others_and_darkens():
-    own = activation_scale().astype(int)
+def test_the_activation_scale_differs_from_other_scales_and_darkens():
+    scale = activation_scale().astype(int)
     for other in (pressure_scale(), strain_scale(), rgb(SLACK)[None]):
-        apart = np.abs(own[:, None] - other[None].astype(int)).max(axis=2)
-        assert apart.min() > 8
-    light = own @ [0.2126, 0.7152, 0.0722]
+        difference = np.abs(scale[:, None] - other[None].astype(int)).max(axis=2)
+        assert difference.min() > 8
+    light = scale @ [0.2126, 0.7152, 0.0722]
     assert (np.diff(light) <= 0.5).all()
     assert light[0] - light[-1] > 100
 
 
-def test_without_muscles_there_is_nothing():
+def test_without_muscles_there_are_no_strands():
     assert muscle_strands([bent_knee()]) == ((), 0.0)

@@ -1,4 +1,4 @@
-"""The page of the viewer, driven in a headless browser and read back from its scene graph."""
+"""The page of the viewer in a headless browser: its scene graph equals the results."""
 
 import numpy as np
 import pytest
@@ -41,13 +41,13 @@ def live(show, chromium):
     server.close()
 
 
-def test_the_file_needs_nothing_but_itself(browser):
+def test_the_file_is_self_contained(browser):
     assert browser.problems == []
     assert all(url.startswith(("file:", "data:", "blob:")) for url in browser.requests)
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-def test_the_slider_moves_the_femur_as_contact_h5_says(browser, folder, frame):
+def test_the_slider_moves_the_femur_to_its_pose_in_contact_h5(browser, folder, frame):
     move_slider(browser, frame)
     drawn = matrix(browser, "/tkamb/0/femoral component/femoral component")
     np.testing.assert_allclose(
@@ -56,7 +56,7 @@ def test_the_slider_moves_the_femur_as_contact_h5_says(browser, folder, frame):
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-def test_the_map_holds_the_pressures_of_contact_h5(browser, folder, frame):
+def test_the_map_shows_the_pressures_of_contact_h5(browser, folder, frame):
     move_slider(browser, frame)
     pressure = read_maps(folder / "contact.h5").pressure_Pa
     drawn, given = levels(browser), pressure[frame]
@@ -67,7 +67,7 @@ def test_the_map_holds_the_pressures_of_contact_h5(browser, folder, frame):
     )
 
 
-def test_the_colour_bar_ends_where_the_data_end(browser, folder):
+def test_the_colour_bar_ends_at_the_largest_pressure(browser, folder):
     peak = read_maps(folder / "contact.h5").pressure_Pa.max() / 1e6
     bar = "document.getElementById('pressure-bar')"
     assert browser.evaluate(f"Number({bar}.dataset.low)") == 0
@@ -79,7 +79,7 @@ def test_the_colour_bar_ends_where_the_data_end(browser, folder):
 
 
 @pytest.mark.parametrize("frame", FRAMES)
-def test_the_arrows_are_the_forces_of_results_csv(browser, show, frame):
+def test_the_arrows_equal_the_forces_of_results_csv(browser, show, frame):
     move_slider(browser, frame)
     results = show.runs[0].results
 
@@ -106,8 +106,8 @@ def test_the_arrows_are_the_forces_of_results_csv(browser, show, frame):
     assert np.linalg.norm(force(browser, "patellofemoral")) == pytest.approx(across, rel=1e-3)
 
 
-def test_the_forces_on_the_patella_balance(browser):
-    """Tendons and contact leave only its weight and inertia: below 2 % of the contact force."""
+def test_the_forces_on_the_patella_are_in_equilibrium(browser):
+    """Weight and inertia of the patella are below 2 % of its contact force."""
     move_slider(browser, 5)
     pull = force(browser, "quadriceps")
     press = -force(browser, "patellofemoral")
@@ -155,7 +155,7 @@ def test_slack_ligaments_are_grey(browser, show):
         assert np.ptp(colour) == 0
 
 
-def test_keys_step_and_choose_the_view(browser):
+def test_keys_change_the_frame_and_the_view(browser):
     press = "document.dispatchEvent(new KeyboardEvent('keydown', {{key: '{}'}}))"
     move_slider(browser, 2)
     browser.evaluate(press.format("ArrowRight"))
@@ -167,7 +167,7 @@ def test_keys_step_and_choose_the_view(browser):
     assert browser.evaluate("tkamb.layerShown('femoral component')")
 
 
-def test_playing_goes_on_and_pauses(browser):
+def test_playing_changes_the_frame(browser):
     move_slider(browser, 0)
     browser.evaluate("tkamb.play(true)")
     moved = browser.evaluate(
@@ -178,14 +178,13 @@ def test_playing_goes_on_and_pauses(browser):
     assert moved
 
 
-def test_a_frame_is_few_enough_triangles_for_software_graphics(browser):
-    """Without a graphics card a frame takes a time that goes with them."""
+def test_a_frame_has_few_enough_triangles_for_software_graphics(browser):
     browser.evaluate("tkamb.look('oblique')")
     browser.evaluate("tkamb.viewer.render()")
     assert browser.evaluate("tkamb.viewer.renderer.info.render.triangles") < 45_000
 
 
-def test_what_was_thinned_is_told(browser):
+def test_a_note_states_the_decimation_of_a_surface(browser):
     notes = browser.evaluate("document.getElementById('notes').textContent")
     assert "of 29168 triangles, at most 0." in notes
 
@@ -194,13 +193,13 @@ def test_no_console_error_at_the_end(browser):
     assert browser.problems == []
 
 
-def test_the_live_window_asks_only_its_own_server(live):
+def test_the_live_window_requests_only_its_own_server(live):
     server, browser = live
     assert browser.problems == []
     assert all(url.startswith((server.url, "data:", "blob:")) for url in browser.requests)
 
 
-def test_another_contact_model_on_the_frame(live):
+def test_another_contact_model_replaces_the_map_of_a_frame(live):
     _, browser = live
     move_slider(browser, 2)
     before = levels(browser)
@@ -228,7 +227,7 @@ def test_a_model_switch_shows_its_progress_and_can_be_cancelled(live):
     move_slider(browser, 2)
     before = levels(browser)
     answer = "document.getElementById('answer').textContent"
-    with switch._lock:  # as if another frame were being computed
+    with switch._lock:  # the computation has to wait
         browser.evaluate(
             "(() => { const s = document.getElementById('contact'); s.value = 'hertz';"
             "s.dispatchEvent(new Event('change')); })()"
@@ -241,12 +240,12 @@ def test_a_model_switch_shows_its_progress_and_can_be_cancelled(live):
     assert np.array_equal(levels(browser), before)
     number = switch.cancel()
     assert number == switch._latest
-    browser.forgive("400")  # the answer of what was cancelled is an error, and says so
+    browser.forgive("400")  # the answer to a cancelled request is an error
     assert browser.problems == []
 
 
 @pytest.mark.slow
-def test_two_contact_models_side_by_side_on_one_scale(folder, chromium, tmp_path):
+def test_two_contact_models_side_by_side_share_a_scale(folder, chromium, tmp_path):
     other = tmp_path / "hertz"
     other.mkdir()
     short_results(other, SCENE, every=50, contact="hertz")
@@ -263,7 +262,7 @@ def test_two_contact_models_side_by_side_on_one_scale(folder, chromium, tmp_path
     assert browser.problems == []
 
 
-def test_a_picture_is_made(show, chromium, tmp_path):
+def test_a_picture_is_written_as_png(show, chromium, tmp_path):
     show.write_png(tmp_path / "knee.png", (640, 480))
     assert (tmp_path / "knee.png").read_bytes().startswith(b"\x89PNG")
 

@@ -1,4 +1,4 @@
-"""The solids of the viewer: decimated surfaces, the foot on its floor, bones, load paths."""
+"""The solids of the viewer: decimated surfaces, foot, floor, bones; and load paths."""
 
 from pathlib import Path
 
@@ -45,7 +45,7 @@ def ball(rings=60):
 
 
 def distances(points, whole, spacing=1e-4):
-    """Return distances (n,) to a surface by samples of it, apart by about the spacing."""
+    """Return distances (n,) of points to samples of a surface with about this spacing, m."""
     mesh = trimesh.Trimesh(whole.vertices, whole.faces)
     samples = trimesh.sample.sample_surface(mesh, int(mesh.area / spacing**2), seed=1)[0]
     return cKDTree(np.concatenate([samples, whole.vertices])).query(points)[0]
@@ -60,7 +60,7 @@ def test_a_decimated_surface_is_within_its_stated_error(most, largest):
         assert distances(one.vertices, other).max() < error + 2e-4
 
 
-def test_a_decimated_surface_faces_outwards_and_encloses_as_much():
+def test_a_decimated_surface_faces_outwards_and_keeps_its_volume():
     whole = ball()
     fewer, error = decimate(whole, 1500)
     outwards = np.einsum("ij,ij->i", fewer.face_normals, fewer.triangles.mean(axis=1))
@@ -69,7 +69,7 @@ def test_a_decimated_surface_faces_outwards_and_encloses_as_much():
     assert abs(volume[0] - volume[1]) < error * 4 * np.pi * 0.03**2
 
 
-def test_flat_faces_and_sharp_edges_survive_thinning():
+def test_decimation_keeps_flat_faces_and_sharp_edges():
     box = trimesh.creation.box((0.02, 0.03, 0.04))
     for _ in range(5):
         box = box.subdivide()
@@ -80,7 +80,7 @@ def test_flat_faces_and_sharp_edges_survive_thinning():
     assert trimesh.Trimesh(fewer.vertices, fewer.faces).volume == pytest.approx(24e-6, rel=1e-6)
 
 
-def test_a_small_surface_is_left_alone():
+def test_a_small_surface_is_not_decimated():
     whole = ball(20)
     fewer, error = decimate(whole, len(whole.faces))
     assert fewer is whole and error == 0.0
@@ -93,7 +93,7 @@ def test_the_shipped_implant_is_drawn_within_a_third_of_a_millimetre(drawing):
         assert drawn.error < 0.35e-3
 
 
-def test_the_ground_reaction_acts_on_the_floor_that_is_drawn(run, drawing):
+def test_the_ground_reaction_acts_on_the_drawn_floor(run, drawing):
     floor = next(one for one in drawing.solids if one.name == "floor")
     arrow = next(one for one in drawing.arrows if one.name == "ground reaction")
     for row, k in enumerate(run.frames):
@@ -105,7 +105,7 @@ def test_the_ground_reaction_acts_on_the_floor_that_is_drawn(run, drawing):
     np.testing.assert_array_equal(marker.points, arrow.points)
 
 
-def test_the_foot_stands_on_the_floor_and_holds_the_ankle(run, drawing):
+def test_the_foot_is_on_the_floor_and_contains_the_ankle(run, drawing):
     foot = next(one for one in drawing.solids if one.name == "foot")
     floor = next(one for one in drawing.solids if one.name == "floor")
     for row, k in enumerate(run.frames):
@@ -117,7 +117,7 @@ def test_the_foot_stands_on_the_floor_and_holds_the_ankle(run, drawing):
         assert (local > low).all() and (local < high).all()
 
 
-def test_no_floor_where_the_reaction_is_put_at_the_ankle():
+def test_no_floor_is_drawn_if_the_reaction_acts_at_the_ankle():
     scene = load_scene(
         MODELS / "deep_knee_bend" / "scene.toml", {"ground_reaction.applied": "ankle"}
     )
@@ -126,14 +126,14 @@ def test_no_floor_where_the_reaction_is_put_at_the_ankle():
 
 def test_centres_of_pressure_lie_on_the_insert(run, drawing):
     rays = run.case.insert.rays
-    found = [one for one in drawing.markers if "centre of pressure" in one.name][-2:]
-    for marker in found:
+    markers = [one for one in drawing.markers if "centre of pressure" in one.name][-2:]
+    for marker in markers:
         assert np.isfinite(marker.points).all()
         down, _ = rays.first(marker.points + np.array([0.0, 1e-3, 0.0]), np.array([0.0, -1.0, 0.0]))
         np.testing.assert_allclose(down, 1e-3, atol=1e-9)
 
 
-def test_a_load_path_is_broken_where_it_jumps():
+def test_a_load_path_is_interrupted_at_a_jump():
     x = np.array(
         [0.0, 1e-3, 2e-3, 2e-3 + 1.5 * METRICS.jump, 3e-3 + 1.5 * METRICS.jump, np.nan, 0.0]
     )
@@ -142,13 +142,13 @@ def test_a_load_path_is_broken_where_it_jumps():
     assert [strand.points.shape[1] for strand in strands] == [3, 2]
 
 
-def test_a_path_of_few_frames_is_not_broken():
+def test_a_load_path_of_few_frames_is_not_interrupted():
     x = np.array([0.0, 0.9, 2.1, 3.2]) * 2 * METRICS.jump
     points = np.column_stack([x, np.zeros(4), np.zeros(4)])
     assert [strand.points.shape[1] for strand in path_strands({"lateral": points})] == [4]
 
 
-def test_the_bone_that_the_scene_names_is_drawn():
+def test_the_bone_mesh_of_the_scene_is_drawn():
     data = Path(__file__).parents[2] / "shared" / "data" / "dm"
     if not data.is_dir():
         pytest.skip("subject DM's data are not beside the project")
@@ -163,10 +163,10 @@ def test_the_bone_that_the_scene_names_is_drawn():
     assert 0.3 < hip < 0.6
 
 
-def test_stand_ins_are_closed_and_as_large_as_their_shapes():
+def test_simple_solids_are_closed_and_have_the_volume_of_their_shapes():
     radius, height = np.array([0.02, 0.01, 0.03]), np.array([0.0, 0.1, 0.2])
     cones = np.diff(height) * (radius[1:] ** 2 + radius[1:] * radius[:-1] + radius[:-1] ** 2) / 3
-    share = 28 / (2 * np.pi) * np.sin(2 * np.pi / 28)  # a polygon's of its circle
+    share = 28 / (2 * np.pi) * np.sin(2 * np.pi / 28)  # area of a 28-gon over its circle's
     for made, volume, rel in (
         (box(np.array([0.3, 0.1, 0.2]), "box"), 6e-3, 1e-12),
         (hull(sphere_points(), "ball"), 4 / 3 * np.pi, 0.01),
@@ -187,6 +187,6 @@ def test_stand_ins_are_closed_and_as_large_as_their_shapes():
         (colours.wear_scale, "YlGnBu", 0.0),
     ],
 )
-def test_the_scales_are_matplotlib_s(scale, name, lowest):
+def test_the_colour_scales_equal_those_of_matplotlib(scale, name, lowest):
     wanted = colormaps[name](np.linspace(lowest, 1.0, 256))[:, :3] * 255.0
     assert np.array_equal(scale(), np.round(wanted))

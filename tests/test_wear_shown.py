@@ -1,4 +1,4 @@
-"""Wear beside a run: the report's section, the viewer's layer, and wear of another scene."""
+"""Wear in the output of a run: the report's section and the viewer's layer."""
 
 import json
 import re
@@ -73,11 +73,11 @@ WEAR = {
 }
 
 OTHERS = (("another's", "these"), ("this", "others"))
-"""Hashes of a scene and its files of which one is not that of `worn`."""
+"""Hashes of a scene and of its files. One of each pair differs from the hash of `worn`."""
 
 
 def put_wear(folder, summary):
-    """Put wear of a scene into a folder: 1 mm off a plate where z is negative."""
+    """Write wear of a scene into a folder: depth 1 mm on a plate where z is negative."""
     content = WEAR | {
         "scene_sha256": ["another's", summary["scene_sha256"]],
         "files_sha256": summary["identity"]["content of a file"],
@@ -92,7 +92,7 @@ def put_wear(folder, summary):
 
 @pytest.fixture
 def worn(tmp_path):
-    """Results with wear of their scene beside them."""
+    """Return results in a folder with wear of their scene."""
     results = make_run("bend")
     identity = {"content of a file": "these", "choice of frames": [0, 101, 1]}
     summary = results.summary | {"scene_sha256": "this", "identity": identity}
@@ -100,7 +100,7 @@ def worn(tmp_path):
     return replace(results, directory=tmp_path, summary=summary)
 
 
-def test_the_report_shows_wear_with_its_band_and_says_first_how_sure_it_is(worn, monkeypatch):
+def test_the_report_shows_wear_with_its_band_after_a_caution(worn, monkeypatch):
     monkeypatch.setattr("tkamb.show.report.svg_text", lambda *_: "<svg></svg>")
     page = report_html(worn)
     section = page[page.index("<h2>Wear</h2>") :]
@@ -121,7 +121,7 @@ def test_the_report_shows_wear_with_its_band_and_says_first_how_sure_it_is(worn,
     assert 'src="data:image/png;base64,' in section
 
 
-def test_wear_of_another_scene_is_not_shown_and_that_is_said(worn):
+def test_wear_of_another_scene_is_not_shown(worn):
     folder = worn.directory
     others = [WEAR | {"scene_sha256": [s], "files_sha256": f} for s, f in OTHERS]
     for content in (WEAR, *others, []):
@@ -136,7 +136,7 @@ def test_wear_of_another_scene_is_not_shown_and_that_is_said(worn):
 
 
 def test_wear_of_other_frames_of_the_run_is_not_shown(worn):
-    """A part of the motion wears otherwise; the whole motion's wear holds beside any frames."""
+    """Wear of the whole motion is shown with a run of any frames."""
     path = worn.directory / "wear.json"
     content = json.loads(path.read_text(encoding="utf-8"))
     for frames, there in (([0, 101, 1], True), ([20, 101, 40], False), (None, True)):
@@ -145,7 +145,7 @@ def test_wear_of_other_frames_of_the_run_is_not_shown(worn):
         assert bool(worn_insert(worn, "right")) == there
 
 
-def test_the_viewers_layer_has_the_depths_of_the_file_and_a_left_knee_is_turned_back(worn):
+def test_the_viewers_layer_has_the_depths_of_the_file_and_mirrors_a_left_knee(worn):
     (right,), (left,) = worn_insert(worn, "right"), worn_insert(worn, "left")
     points, faces = read_vtp(worn.directory / "wear.vtp")
     assert right.surface.vertices == pytest.approx(points)
@@ -156,11 +156,11 @@ def test_the_viewers_layer_has_the_depths_of_the_file_and_a_left_knee_is_turned_
         read_vtp_values(worn.directory / "wear.vtp", "depth")
 
 
-def test_colours_go_from_the_inserts_own_to_the_deepest():
-    found = wear_colours([0.0, 1e-9, 0.2], 0.2)
-    assert found[0] == pytest.approx(rgb(INSERT))
-    assert found[1] == pytest.approx(wear_scale()[0])
-    assert found[2] == pytest.approx(wear_scale()[255])
+def test_unworn_points_have_the_colour_of_the_insert():
+    colours = wear_colours([0.0, 1e-9, 0.2], 0.2)
+    assert colours[0] == pytest.approx(rgb(INSERT))
+    assert colours[1] == pytest.approx(wear_scale()[0])
+    assert colours[2] == pytest.approx(wear_scale()[255])
 
 
 @pytest.mark.slow
@@ -190,14 +190,14 @@ def test_the_page_switches_between_the_new_and_the_worn_insert(tmp_path):
 @pytest.mark.parametrize(
     "damage", [{"bands": 3}, {"bands": {"samples": 1}}, {"cycles": "many"}, {"questions": None}]
 )
-def test_a_damaged_wear_json_is_one_line(worn, damage):
+def test_a_damaged_wear_json_is_refused(worn, damage):
     path = worn.directory / "wear.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | damage), encoding="utf-8")
     with pytest.raises(InputError, match=r"not as tkamb wear writes it.*run tkamb wear again"):
         wear_section(worn)
 
 
-def test_wear_that_names_no_scene_is_not_shown(worn):
+def test_wear_without_the_hash_of_a_scene_is_not_shown(worn):
     path = worn.directory / "wear.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"scene_sha256": 5}))
     assert wear_section(worn) == {"other": OTHER_WEAR}

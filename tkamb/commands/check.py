@@ -41,7 +41,7 @@ def _check(options: argparse.Namespace) -> int:
 
     if options.out and options.out.suffix.lower() not in PICTURES:
         hint = f"name it like check{PICTURES[0]}"
-        raise InputError(f"is none of {', '.join(PICTURES)}", options.out, hint)
+        raise InputError(f"does not end in {' or '.join(PICTURES)}", options.out, hint)
     check_output_file(options.out, options.force)
     with Stages(4 if options.out else 3) as stages:
         result = check_scene(options.scene, dict(options.set), stages.begin)

@@ -289,7 +289,7 @@ def _cycle(text: str) -> "tuple[float, float] | Literal['plates']":
         return "plates"
     start, end = _interval(text)
     if start >= end:
-        raise argparse.ArgumentTypeError(f"'{text}' does not rise")
+        raise argparse.ArgumentTypeError(f"the times in '{text}' do not increase")
     return start, end
 
 
@@ -313,9 +313,9 @@ def import_request(options: argparse.Namespace) -> "ImportRequest":
     from tkamb.io.recordings.unit_words import GivenUnits
 
     if not options.mass_kg > 0:
-        raise InputError(f"{options.mass_kg:g} kg is no mass", "--mass-kg")
+        raise InputError(f"a mass of {options.mass_kg:g} kg is not positive", "--mass-kg")
     if not options.cutoff_hz > 0:
-        raise InputError(f"{options.cutoff_hz:g} Hz is no frequency", "--cutoff-hz")
+        raise InputError(f"a frequency of {options.cutoff_hz:g} Hz is not positive", "--cutoff-hz")
     for name in ("force_unit", "moment_unit"):
         if getattr(options, name) and not (options.c3d and options.grf is None):
             option = f"--{name.replace('_', '-')}"
@@ -326,7 +326,7 @@ def import_request(options: argparse.Namespace) -> "ImportRequest":
         raise InputError("needs --grf", "--grf-force")
     if Path(options.scene).name != options.scene or not options.scene.endswith(".toml"):
         hint = "--out names the folder"
-        raise InputError(f"'{options.scene}' is no name of a .toml file", "--scene", hint)
+        raise InputError(f"'{options.scene}' is not a name of a .toml file", "--scene", hint)
     return ImportRequest(
         options.model,
         options.side,

@@ -246,7 +246,7 @@ def without_cache(contact: str | None) -> dict[str, Any]:
     """Return the option that turns off the cache of a contact model on disk.
 
     Raises:
-        InputError: there is no such model, or it has no cache.
+        InputError: no contact is modelled, or the contact model does not exist or has no cache.
     """
     from tkamb.contact.registry import contact_options
 

@@ -100,9 +100,9 @@ class Rule:
     Args:
         option: name of the option on the command line.
         needs: options; at least one of them must be given. Empty: none is needed.
-        excludes: options that take away the effect of `option`.
+        excludes: options with which `option` has no effect.
         because: reason, printed after "does not go with --x" or "needs --x".
-        unless: value of the excluded option with which `option` has an effect.
+        unless: value of the excluded option with which `option` still has an effect.
     """
 
     option: str
@@ -211,7 +211,7 @@ def check_options(
     Args:
         parser: parser of the whole command line.
         arguments: arguments that the parser has accepted.
-        options: the parsed options.
+        options: parsed options.
 
     Raises:
         InputError: an option has no effect; the message names what it needs or excludes.
@@ -237,7 +237,7 @@ def check_options(
 def command_of(
     parser: argparse.ArgumentParser, arguments: Sequence[str]
 ) -> tuple[str, argparse.ArgumentParser, Sequence[str]]:
-    """Return the command's name, its own parser, and the arguments after its name."""
+    """Return the name of the command, its parser, and the arguments after the name."""
     names, remaining = [], list(arguments)
     while verbs := _verbs(parser):
         index = next((k for k, word in enumerate(remaining) if word in verbs), None)
@@ -251,7 +251,7 @@ def command_of(
 def leaf_parsers(
     parser: argparse.ArgumentParser, name: str = ""
 ) -> Iterator[tuple[str, argparse.ArgumentParser]]:
-    """Yield every command with its own parser."""
+    """Yield the name and the parser of every command."""
     verbs = _verbs(parser)
     if not verbs:
         yield name, parser
@@ -267,9 +267,9 @@ def _verbs(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser
 
 
 def _option_names(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> set[str]:
-    """Return the long names of all options among the arguments, even if abbreviated.
+    """Return the long names of the options in the arguments, also of abbreviated ones.
 
-    The metavar stands for an optional positional argument.
+    An optional positional argument is represented by its metavar.
     """
     names = {
         name: next(o for o in action.option_strings if o.startswith("--"))

@@ -109,7 +109,7 @@ def _export_deck(options: argparse.Namespace) -> int:
 
     if options.out.suffix.lower() != SUFFIX[options.deck]:
         suffix = SUFFIX[options.deck]
-        raise InputError(f"is no {suffix} file", options.out, f"give a name like frame{suffix}")
+        raise InputError(f"is not a {suffix} file", options.out, f"give a name like frame{suffix}")
     if options.resolution is not None and not 0 < options.resolution <= MAP_GRID.coarsest_mm:
         hint = f"give more than 0, at most {MAP_GRID.coarsest_mm:g} mm"
         raise InputError(f"resolution {options.resolution} mm", "--resolution", hint)
@@ -178,7 +178,7 @@ def _report(options: argparse.Namespace) -> int:
     from tkamb.run.results_folder import REPORT_NAME, read_results
     from tkamb.show.report import write_report
 
-    results = read_results(options.folder)  # before a folder is made or marked
+    results = read_results(options.folder)  # an unreadable folder must stay unchanged
     with claimed_directory(options.folder) as folder:
         write_report(results, folder / REPORT_NAME)
     print(f"report: {options.folder / REPORT_NAME}")

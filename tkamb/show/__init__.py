@@ -11,10 +11,10 @@ from typing import Any
 
 
 class _CallableModule(ModuleType):
-    """This package, which can still be called like the former function of its name."""
+    """This package as a function, for the old call `tkamb.show(results)`."""
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
-        """Return what `tkamb.view` returns, with a warning."""
+        """Return the result of `tkamb.view`, with a warning."""
         from tkamb.show.view.show import show
 
         warnings.warn("tkamb.show is now tkamb.view", DeprecationWarning, stacklevel=2)

@@ -1,4 +1,4 @@
-"""The report's horizontal axis, and which frames stand for the whole motion."""
+"""The report's horizontal axis, and a choice of frames that represent the motion."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ class HorizontalAxis:
 
     Args:
         kind: "flexion", "cycle" or "time".
-        values: (f,) deg, per cent or s.
+        values: (f,) positions of the frames, deg, % or s.
         stances: begin and end of each stance on the axis; empty if the axis is flexion.
     """
 
@@ -37,7 +37,7 @@ class HorizontalAxis:
         return LABELS[self.kind]
 
     def at(self, frame: int) -> str:
-        """Return where a frame lies, with its unit."""
+        """Return the position of a frame on the axis as text with its unit."""
         digits = 2 if self.kind == "time" else 0
         return f"{self.values[frame]:.{digits}f}{UNITS[self.kind]}"
 
@@ -50,10 +50,10 @@ class HorizontalAxis:
         return np.insert(x, cuts, np.nan), np.insert(values, cuts, np.nan)
 
     def stops(self, count: int) -> NDArray[np.int64]:
-        """Return about `count` frames spread evenly over the motion, in its order.
+        """Return about `count` frames spread evenly over the motion, in time order.
 
-        On a flexion axis that rises or falls throughout they lie at round angles, otherwise
-        at even times.
+        They are evenly spaced in time if flexion is the axis and not monotonic. Otherwise they
+        are the frames nearest to round values of the axis.
         """
         x = self.values
         steps = np.diff(x)
@@ -67,7 +67,7 @@ class HorizontalAxis:
         return self.nearest(ticks)
 
     def nearest(self, values: Iterable[float]) -> NDArray[np.int64]:
-        """Return the frames nearest to these places, without repeats, in time order."""
+        """Return the frames nearest to these values of the axis, in time order, each once."""
         return np.unique([int(np.argmin(np.abs(self.values - place))) for place in values])
 
 
@@ -81,13 +81,13 @@ def round_step(step: float) -> float:
 
 
 def horizontal_axis(results: "Results", kind: str | None = None) -> HorizontalAxis:
-    """Return the axis that the summary's `axis` (or `kind`) asks for.
+    """Return the horizontal axis of kind `kind`; None: the kind in the summary, else flexion.
 
-    Per cent of the cycle are the column of that name; without it they are counted from the
-    summary's `cycle_percent_s` = (time of 0 %, time of 100 %), or over the whole motion.
+    A cycle axis uses the column `cycle_percent`. Without this column, 0 and 100 % are the times
+    `cycle_percent_s` of the summary, or the ends of the motion.
 
     Raises:
-        InputError: an axis that does not exist.
+        InputError: the kind does not exist.
     """
     kind = kind or results.summary.get("axis") or "flexion"
     if kind == "flexion":
@@ -108,14 +108,14 @@ def horizontal_axis(results: "Results", kind: str | None = None) -> HorizontalAx
 
 
 def _stances(results: "Results", start: float, end: float) -> tuple[tuple[float, float], ...]:
-    """Return the stances (s) that the force plates show, cut at start and end (s)."""
+    """Return begin and end of the measured stances, limited to `start` and `end`, s."""
     stance = (results.summary.get("gait") or {}).get("stance_s") or ()
     cut = [(max(float(on), start), min(float(off), end)) for on, off in stance]
     return tuple((on, off) for on, off in cut if on < off)
 
 
 def _stances_in_cycle(results: "Results") -> tuple[tuple[float, float], ...]:
-    """Return the stances within the cycle, per cent of it."""
+    """Return begin and end of the stances in the cycle, %."""
     cycle = results.summary.get("cycle_percent_s")
     if cycle is None:
         return ()

@@ -1,4 +1,4 @@
-"""The cohort's report: one self-contained page, with the groups side by side."""
+"""The report of a cohort: one self-contained page that compares the groups."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -38,19 +38,19 @@ SHOWN = {
     "lateral_area_mm2": ("Contact area, lateral", "mm²", 0),
     "quadriceps_N": ("Quadriceps tension", "N", 0),
 }
-"""Column -> title, unit and digits."""
+"""Column -> title, unit and number of decimals."""
 AT_ONCE = len(COLOURS)
-"""Groups in one plot."""
+"""Largest number of groups in one plot."""
 
 
 @dataclass(frozen=True)
 class CohortReportSettings:
-    """How much a cohort's page shows."""
+    """Limits of a cohort's page."""
 
     most_maps: int = 24
-    """Pressure maps on the page. Chosen: more make it slow to open."""
+    """Largest number of pressure maps. Chosen because more make the page slow to open."""
     most_failed: int = 100
-    """Failed runs that the page lists. Chosen: the page stays readable."""
+    """Largest number of failed runs in the list. Chosen because the page stays readable."""
 
 
 COHORT_REPORT = CohortReportSettings()
@@ -128,7 +128,7 @@ def _cards(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Gro
     result = [
         Card("Runs computed", f"{len(outcomes) - failed} of {len(outcomes)}", detail, failed > 0)
     ]
-    words = "no numbers in those that failed" if failures else "none failed"
+    words = "failed frames have no numbers" if failures else "none failed"
     if flagged := sum(one.flagged_frames for one in outcomes.values()):
         words += f"; {flagged} to be read with care, see their status in cohort.parquet"
     result.append(Card("Frames computed", f"{frames - failures} of {frames}", words, failures > 0))
@@ -151,7 +151,7 @@ def _cards(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Gro
 
 
 def _wear_card(outcomes: Mapping[int, Outcome], groups: Sequence[Group]) -> Card:
-    """Return the groups' worn volumes from least to most, and what they say of designs."""
+    """Return the range of the groups' worn volumes, with a caution on comparing designs."""
     lost = sum(bool(one.wear_problem) for one in outcomes.values())
     name = "volume_mm3_per_Mc"
     means = [float(np.nanmean(group.wear[name])) for group in groups if name in group.wear]
@@ -167,7 +167,7 @@ def _wear_card(outcomes: Mapping[int, Outcome], groups: Sequence[Group]) -> Card
 
 
 def _wear_table(groups: Sequence[Group]) -> dict[str, Any] | None:
-    """Return each group's worn volume, its range, its depth and the first cycle by every law."""
+    """Return a row per group: worn volume, its range, depth, and initial wear rate by each law."""
     groups = [group for group in groups if "volume_mm3_per_Mc" in group.wear]
     if not groups:
         return None
@@ -184,7 +184,7 @@ def _wear_table(groups: Sequence[Group]) -> dict[str, Any] | None:
 
 
 def _row(group: Group, names: Sequence[str]) -> list[str]:
-    """Return a group's line of the table: how many runs, and the peaks."""
+    """Return a group's row of the table: numbers of runs and of failed runs, and the peaks."""
     cells = [group.name, str(len(group.numbers)), str(group.failed or "")]
     for name in names:
         over = spread(group.peaks.get(name, np.array([np.nan]))[:, None])
@@ -202,23 +202,23 @@ def _row(group: Group, names: Sequence[str]) -> list[str]:
 
 
 def _plots(groups: Sequence[Group]) -> Any:
-    """Yield plots per quantity and axis, each with as many groups as colours can distinguish."""
+    """Yield the plots of each quantity and axis, with at most `AT_ONCE` groups in each."""
     for name in _there(groups):
         for axis in dict.fromkeys(group.axis for group in groups):
-            own = [group for group in groups if group.axis == axis and name in group.bins]
-            highest = max(_highest(group, name) for group in own) if own else 0.0
-            for place, (words, part) in enumerate(_split_into_plots(own)):
+            drawn = [group for group in groups if group.axis == axis and name in group.bins]
+            highest = max(_highest(group, name) for group in drawn) if drawn else 0.0
+            for place, (words, part) in enumerate(_split_into_plots(drawn)):
                 title = ", ".join(filter(None, (SHOWN[name][0], words)))
                 svg = svg_text(draw_groups(part, name, highest), f"{name}-{axis}-{place}")
                 yield {"title": title, "unit": SHOWN[name][1], "svg": svg}
 
 
 def _split_into_plots(groups: Sequence[Group]) -> list[tuple[str, dict[str, Group]]]:
-    """Return the plots: for each, the label that its groups share, and name -> group.
+    """Return for each plot the label value that its groups share, and its groups by name.
 
-    If there are too many groups for one plot, each plot shows one value of a label. It is the label
-    with the fewest values that leaves few enough groups in each plot. If there is none, the groups
-    are divided in their order.
+    If there are too many groups for one plot, each plot shows one value of a label. The label is
+    the one with the fewest values that leaves at most `AT_ONCE` groups in a plot. Without such a
+    label the groups are divided in their order.
     """
     if len(groups) > AT_ONCE:
         values = {
@@ -235,7 +235,7 @@ def _split_into_plots(groups: Sequence[Group]) -> list[tuple[str, dict[str, Grou
 
 
 def _highest(group: Group, name: str) -> float:
-    """Return the top of a group's line and shade."""
+    """Return the largest mean plus standard deviation of a group over the motion."""
     over = spread(group.bins[name])
     return float(np.nanmax(over.mean + np.nan_to_num(over.sd), initial=0.0))
 
@@ -244,9 +244,9 @@ def draw_groups(groups: Mapping[str, Group], name: str, highest: float) -> Figur
     """Return the groups' means of a column over the motion, with one standard deviation.
 
     Args:
-        groups: the legend's name -> group.
+        groups: name in the legend -> group.
         name: name of the column.
-        highest: top of the vertical axis, shared by plots beside each other, unit of the column.
+        highest: largest value of all plots of the column, which share one vertical scale.
     """
     with settings():
         figure = new_figure(5.4, 3.1)
@@ -263,7 +263,7 @@ def draw_groups(groups: Mapping[str, Group], name: str, highest: float) -> Figur
 
 def _draw_group(axes: Axes, group: Group, label: str, name: str, colour: str) -> None:
     over, middle = spread(group.bins[name]), 0.5 * (group.edges[:-1] + group.edges[1:])
-    filled = over.runs > 0  # lines run on over bins that no frame falls into
+    filled = over.runs > 0  # the line crosses bins without frames
     middle, mean, sd = middle[filled], over.mean[filled], over.sd[filled]
     axes.plot(middle, mean, "o-", color=colour, markersize=3, label=label)
     axes.fill_between(middle, mean - sd, mean + sd, color=colour, alpha=0.13, linewidth=0)
@@ -282,7 +282,7 @@ def _maps(
     return {
         "svg": svg_text(draw_group_maps(cohort, outcomes, with_map), "maps"),
         "frame": frame,
-        "whose": "runs that differ in nothing but the labels of their groups, those with peak "
+        "whose": "runs that differ only in the labels of their groups, those with peak "
         "forces nearest to the groups' medians"
         if alike
         else "the run whose peak force is its group's median",
@@ -293,36 +293,41 @@ def _maps(
 def _typical(
     cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Group]
 ) -> tuple[list[tuple[Group, int]], bool]:
-    """Return each group's run to show, and whether the runs differ in the groups' labels alone.
+    """Return one run of each group, and whether these runs differ only in the groups' labels.
 
-    Maps of one person beside each other are easier to compare. So the runs agree in all labels
-    that do not make the groups (subject, trial and so on), if every group has such a run. Of
-    several, those are returned whose peak forces are nearest to the groups' medians. Otherwise
-    each group shows the run of its own median. Runs without a map are left out.
+    Maps of the same subject and trial are easiest to compare. If possible, all runs therefore
+    share the labels that do not define the groups. Among several such sets, the peak forces of the
+    returned one are nearest to the groups' medians. Otherwise each group has the run with its
+    median peak force. Runs without a map are ignored.
     """
     peaks = [
         {
-            _rest(cohort, group, n): (n, float(np.nanmax(outcomes[n].columns["force_total_BW"])))
+            _other_labels(cohort, group, n): (
+                n,
+                float(np.nanmax(outcomes[n].columns["force_total_BW"])),
+            )
             for n in group.numbers
             if outcomes[n].chosen is not None
         }
         for group in groups
     ]
-    there = [(group, own) for group, own in zip(groups, peaks, strict=True) if own]
-    if not there:
+    mapped = [(group, runs) for group, runs in zip(groups, peaks, strict=True) if runs]
+    if not mapped:
         return [], False
-    medians = [sorted(peak for _, peak in own.values())[(len(own) - 1) // 2] for _, own in there]
-    pairs = list(zip((own for _, own in there), medians, strict=True))
-    common = [rest for rest in there[0][1] if all(rest in own for _, own in there)]
+    medians = [
+        sorted(peak for _, peak in runs.values())[(len(runs) - 1) // 2] for _, runs in mapped
+    ]
+    pairs = list(zip((runs for _, runs in mapped), medians, strict=True))
+    common = [labels for labels in mapped[0][1] if all(labels in runs for _, runs in mapped)]
     if common:
-        rest = min(common, key=lambda rest: sum(abs(own[rest][1] - m) for own, m in pairs))
-        return [(group, own[rest][0]) for group, own in there], True
-    nearest = [min(own.values(), key=lambda one: abs(one[1] - m))[0] for own, m in pairs]
-    return [(group, n) for (group, _), n in zip(there, nearest, strict=True)], False
+        labels = min(common, key=lambda key: sum(abs(runs[key][1] - m) for runs, m in pairs))
+        return [(group, runs[labels][0]) for group, runs in mapped], True
+    nearest = [min(runs.values(), key=lambda one: abs(one[1] - m))[0] for runs, m in pairs]
+    return [(group, n) for (group, _), n in zip(mapped, nearest, strict=True)], False
 
 
-def _rest(cohort: Cohort, group: Group, number: int) -> tuple[str, ...]:
-    """Return the labels of a run that do not make its group."""
+def _other_labels(cohort: Cohort, group: Group, number: int) -> tuple[str, ...]:
+    """Return the labels of a run that do not define its group."""
     return tuple(v for k, v in cohort.runs[number].labels.items() if k not in group.labels)
 
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PairingSettings:
-    """Condition on which frames of two runs are the same instant."""
+    """Pairing of frames of two runs."""
 
     tolerance: float = 1e-6
     """deg, per cent or s: frames with a smaller distance on the axis are the same instant of one
@@ -36,13 +36,13 @@ PAIRING = PairingSettings()
 
 @dataclass(frozen=True, eq=False)
 class Pairing:
-    """Places of the f frames of the first run among the frames of another run.
+    """Interpolation of another run at the f frames of the first run.
 
     Args:
-        lower: frame of the other run at or before the place, shape (f,); -1: no place.
-        upper: frame of the other run at or after the place, shape (f,).
+        lower: the other run's frame before each frame of the first, shape (f,); -1: not comparable.
+        upper: the other run's frame after each frame of the first, shape (f,).
         weight: weight of the upper frame, 0 to 1, shape (f,).
-        exact: True: each frame has a partner at the same time, and nothing is interpolated.
+        exact: whether frames are paired at equal times, without interpolation.
     """
 
     lower: Index
@@ -51,13 +51,13 @@ class Pairing:
     exact: bool
 
     def values(self, column: Array) -> Array:
-        """Return a column of the other run at the frames (f,) of the first; NaN without a place."""
+        """Return a column of the other run at the first run's frames (f,); NaN: not comparable."""
         low, high = column[self.lower], column[self.upper]
         between = (1.0 - self.weight) * low + self.weight * high
         return np.where(self.lower < 0, np.nan, np.where(self.weight > 0, between, low))
 
     def nearest(self, frame: int) -> int | None:
-        """Return the other run's frame nearest to a frame of the first; None without a place."""
+        """Return the other run's frame nearest to a frame of the first; None: not comparable."""
         if self.lower[frame] < 0:
             return None
         return int((self.upper if self.weight[frame] > 0.5 else self.lower)[frame])
@@ -68,24 +68,24 @@ def pair_frames(
 ) -> Pairing | None:
     """Pair the frames of two runs.
 
-    If every frame of the shorter run has a match at the same time and place on the axis, both runs
-    have the same recording and these frames are paired. Otherwise the other run is interpolated
-    linearly within its range. This needs axes that rise or fall throughout. The result is None for
-    other axes, because their places are not unique.
+    If every frame of the shorter run has a match at the same time and position on the axis, both
+    runs have the same recording and these frames are paired. Otherwise the other run is
+    interpolated linearly within its range. This needs monotonic axes. For other axes the result is
+    None.
     """
     same = _same_frames(first["time_s"], first_axis.values, other["time_s"], other_axis.values)
     if same is not None:
         return Pairing(same, same, np.zeros(len(same)), True)
-    x, known = first_axis.values, other_axis.values
-    ways = [np.sign(np.diff(values)) for values in (x, known)]
-    if len(known) < 2 or not all((way == ways[1][0]).all() and way.all() for way in ways):
+    x, other_x = first_axis.values, other_axis.values
+    signs = [np.sign(np.diff(values)) for values in (x, other_x)]
+    if len(other_x) < 2 or not all((sign == signs[1][0]).all() and sign.all() for sign in signs):
         return None
-    order = slice(None, None, int(ways[1][0]))
-    rising = known[order]
+    order = slice(None, None, int(signs[1][0]))
+    rising = other_x[order]
     after = np.clip(np.searchsorted(rising, x, side="right"), 1, len(rising) - 1)
     weight = (x - rising[after - 1]) / (rising[after] - rising[after - 1])
     inside = (weight >= -1e-12) & (weight <= 1 + 1e-12)
-    index = np.arange(len(known))[order]
+    index = np.arange(len(other_x))[order]
     lower, upper = index[after - 1], index[after]
     lower, weight = np.where(weight >= 1.0, upper, lower), np.where(weight >= 1.0, 0.0, weight)
     return Pairing(np.where(inside, lower, -1), upper, np.clip(weight, 0.0, 1.0), False)
@@ -94,7 +94,7 @@ def pair_frames(
 def _same_frames(
     first_time: Array, first_place: Array, other_time: Array, other_place: Array
 ) -> Index | None:
-    """Return the matching frame (f,) of the other run, -1 without one; None: other recording."""
+    """Return the matching frames (f,) of the other run, -1: no match; None: other recording."""
     at = {float(time): k for k, time in enumerate(other_time)}
     result = np.array([at.get(float(time), -1) for time in first_time], np.int64)
     paired = result >= 0
@@ -140,7 +140,7 @@ class Run:
         folder: folder of the results.
         results: results in the folder.
         axis: horizontal axis of its curves.
-        pairing: places of the first run's frames in this run; None: they are not unique.
+        pairing: pairing with the frames of the first run; None: frames cannot be paired.
     """
 
     label: str
@@ -161,7 +161,7 @@ class Difference:
         percent: largest difference, % of the largest absolute value of the first run; NaN if that
             value is zero.
         at_frame: frame of the first run with the largest difference.
-        at: place of that frame on the axis, deg, per cent or s.
+        at: position of this frame on the axis, deg, % or s.
         rms: root mean square of the differences.
         mean: mean of the signed differences.
         frames: number of compared frames.
@@ -184,7 +184,7 @@ class Comparison:
 
     Args:
         runs: at least two runs.
-        kind: kind of the axis: "flexion", "cycle" or "time".
+        kind: kind of the horizontal axis: "flexion", "cycle" or "time".
         notes: sentences on different settings and on columns that cannot be compared.
         differences: one per column of each run after the first.
     """
@@ -236,22 +236,22 @@ def compare_folders(folders: Sequence[str | Path], axis: str | None = None) -> C
         what = f"needs two to {COMPARE.max_runs} folders of results, not {len(folders)}"
         raise InputError(what, "compare", "name each folder that `tkamb run` wrote")
     paths = [Path(folder) for folder in folders]
-    read = [read_results(path) for path in paths]
-    for path, results in zip(paths, read, strict=True):
+    loaded = [read_results(path) for path in paths]
+    for path, results in zip(paths, loaded, strict=True):
         if not len(results):
             raise InputError("holds no frame", path, "run it again: tkamb run")
-    kind = axis or _common_axis(paths, read)
-    axes = [horizontal_axis(results, kind) for results in read]
+    kind = axis or _common_axis(paths, loaded)
+    axes = [horizontal_axis(results, kind) for results in loaded]
     runs = tuple(
-        Run(label, path, results, own, pair_frames(read[0], axes[0], results, own))
-        for label, path, results, own in zip(_labels(paths), paths, read, axes, strict=True)
+        Run(label, path, results, x, pair_frames(loaded[0], axes[0], results, x))
+        for label, path, results, x in zip(_labels(paths), paths, loaded, axes, strict=True)
     )
     result = [one for run in runs[1:] for one in differences(runs[0], run)]
     return Comparison(runs, kind, tuple(_notes(runs)), tuple(result))
 
 
-def _common_axis(paths: Sequence[Path], read: Sequence[Results]) -> str:
-    kinds = [str(results.summary.get("axis") or "flexion") for results in read]
+def _common_axis(paths: Sequence[Path], loaded: Sequence[Results]) -> str:
+    kinds = [str(results.summary.get("axis") or "flexion") for results in loaded]
     for path, kind in zip(paths, kinds, strict=True):
         if kind != kinds[0]:
             what = f"is drawn over {kind}, {paths[0]} over {kinds[0]}"

@@ -28,16 +28,16 @@ if TYPE_CHECKING:
 
 WIDTH, HEIGHT = 5.4, 2.7
 DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.2, 1.2, 1.2)))
-"""Line styles, so that runs can be distinguished without colour and where they coincide."""
+"""Line styles: runs can be distinguished without colour, and where they coincide."""
 
 
 @dataclass(frozen=True)
 class CompareFigureSettings:
-    """Pictures of compared runs."""
+    """Plots of compared runs."""
 
     failed_row_height: float = 0.03
-    """1: height of the crosses of failed frames above the bottom, and their distance from run to
-    run, as a share of the picture's height. Chosen by eye."""
+    """1: distance between the rows of crosses that mark failed frames, as a share of the plot's
+    height. Each run has a row. Chosen by eye."""
 
 
 COMPARE_FIGURE = CompareFigureSettings()
@@ -92,10 +92,10 @@ def run_colour(number: int) -> str:
 
 
 def draw_quantity(comparison: Comparison, quantity: Quantity) -> Figure | None:
-    """Return one quantity of all runs over the axis; None where no run has it.
+    """Return a plot of one quantity of all runs; None: no run has it, or it is the axis itself.
 
-    Each line is drawn in time order and broken where a frame failed; crosses at the bottom, in
-    the run's colour, say where.
+    Each line is drawn in time order and broken at failed frames. Crosses at the bottom, in the
+    run's colour, mark the failed frames.
     """
     curves = [quantity.values(run.results) for run in comparison.runs]
     if not any(np.isfinite(values).any() for values in curves):
@@ -116,7 +116,7 @@ def draw_quantity(comparison: Comparison, quantity: Quantity) -> Figure | None:
 def _draw_curve(axes: Axes, number: int, run: Run, values: Array) -> None:
     x, y = run.axis.broken(values)
     colour, dashes = run_colour(number), DASHES[number % len(DASHES)]
-    marker = "o" if len(values) == 1 else ""  # a line of one point would not be seen
+    marker = "o" if len(values) == 1 else ""  # a line of one point would be invisible
     axes.plot(x, y, color=colour, linestyle=dashes, gid=f"run-{number}", marker=marker)
     failures = failed(run.results)
     height = np.full(int(failures.sum()), COMPARE_FIGURE.failed_row_height * (1 + number))
@@ -127,10 +127,10 @@ def _draw_curve(axes: Axes, number: int, run: Run, values: Array) -> None:
 
 
 def shown_frame(comparison: Comparison) -> int:
-    """Return the frame of the first run whose maps are shown.
+    """Return the frame of the first run at which maps are shown by default.
 
-    It is the frame with the largest contact force among those at which most runs have a map; 0 if
-    no frame has a force.
+    It has the largest contact force among the frames at which most runs have a map. It is 0 if no
+    frame has a force.
     """
     force = comparison.runs[0].results["force_total_BW"]
     finite = np.isfinite(force)
@@ -141,7 +141,7 @@ def shown_frame(comparison: Comparison) -> int:
 
 
 def _mapped(run: Run, frames: int) -> Index:
-    """Return (f,) 1 for every frame of the first run at which this run has a map, else 0."""
+    """Return an array (f,): 1 if this run has a map at the frame of the first run, else 0."""
     if run.pairing is None:
         return np.zeros(frames, np.int64)
     rows = map_rows(run.results)
@@ -149,12 +149,11 @@ def _mapped(run: Run, frames: int) -> Index:
 
 
 def draw_maps(comparison: Comparison, frame: int) -> Figure | None:
-    """Return the runs' pressure maps at one place, on one scale; None without any map.
+    """Return the runs' pressure maps on one colour scale; None without any map.
 
     Args:
-        comparison: the runs.
-        frame: of the first run; of the others the nearest frame on the axis, which the titles
-            name.
+        comparison: compared runs.
+        frame: frame of the first run. Each other run shows its nearest frame on the axis.
     """
     frames = [
         None if run.pairing is None else run.pairing.nearest(frame) for run in comparison.runs
@@ -169,7 +168,7 @@ def draw_maps(comparison: Comparison, frame: int) -> Figure | None:
 
 
 def _map_at(results: "Results", frame: int) -> Array | None:
-    """Return the pressures (n,) MPa of a frame; None where it has no map."""
+    """Return the pressures (n,) of a frame, MPa; None: the frame has no map."""
     row = map_rows(results).get(frame)
     if results.maps is None or row is None:
         return None
@@ -213,16 +212,16 @@ FIRST = (
     "medial_cop_ap_mm", "lateral_cop_ap_mm", "quadriceps_N", "patellar_ligament_N",
     "patellofemoral_N", "approach_mm",
 )  # fmt: skip
-"""Columns of the table that is printed and shown first; the page has the others below it."""
+"""Columns of the table that is printed and that comes first on the page."""
 
 
 def headline(comparison: Comparison) -> list[Difference]:
-    """Return the differences of the most important columns."""
+    """Return the differences of the columns in `FIRST`."""
     return [one for name in FIRST for one in comparison.differences if one.column == name]
 
 
 def check_frame(comparison: Comparison, frame: int | None) -> int:
-    """Return the frame of the first run at which maps are shown.
+    """Return the frame of the first run at which maps are shown; negative ones count from the end.
 
     Raises:
         InputError: the first run has no such frame.
@@ -237,7 +236,7 @@ def check_frame(comparison: Comparison, frame: int | None) -> int:
 
 
 def comparison_html(comparison: Comparison, frame: int | None = None) -> str:
-    """Return the page: different settings, curves, maps at a frame, differences.
+    """Return the page: curves, maps at a frame, differences and notes.
 
     Raises:
         InputError: the first run has no such frame.
@@ -306,7 +305,7 @@ def _rows(comparison: Comparison, differences: Sequence[Difference]) -> list[lis
 
 
 def peak_lines(comparison: Comparison) -> list[str]:
-    """Return each run's peak forces with their bands, and its peak pressure, a line each."""
+    """Return lines with each run's peak forces and bands, peak pressure and muscles at a limit."""
     lines = []
     for run in comparison.runs:
         peaks = peaks_of(run.results.summary)

@@ -1,8 +1,8 @@
-"""The map that follows the report's slider: every frame's pressure as bytes of one grey picture.
+"""Pressure maps of all frames as one grey picture, for the report's slider.
 
-A byte is `FRAME_MAP.rim_byte` where the contact ends, larger in contact (255 for the largest
+A byte is `FRAME_MAP.rim_byte` at the edge of contact, larger in contact (255 for the largest
 pressure of the run) and smaller outside. The page interpolates linearly between the bytes and
-colours the larger ones.
+colours the contact.
 """
 
 from dataclasses import dataclass
@@ -31,14 +31,14 @@ class FrameMapSettings:
     """The pressure maps behind the report's frame slider."""
 
     rim_byte: int = 64
-    """Byte of the page's picture where the contact ends; above it there is pressure. Chosen: bytes
-    below it describe the fading rim."""
+    """Byte at the edge of contact; larger bytes are pressure. Chosen because smaller bytes then
+    place the edge between grid points."""
     most_frames: int = 250
     """Largest number of maps in the page. A longer run shows the map of the nearest frame at each
-    position of the slider. Chosen: it limits the size of the page."""
+    position of the slider. Chosen because it limits the size of the page."""
     coarsening: int = 2
-    """Ratio of the grid in the page to the grid of the picture. Chosen: the page is a quarter of
-    the size."""
+    """Grid step of the slider's maps divided by the grid step of the report's still maps. Chosen
+    because the data are a quarter of the size."""
 
 
 FRAME_MAP = FrameMapSettings()
@@ -59,24 +59,24 @@ def draw_insert(view: TopView, largest: float) -> Figure:
 
 
 def largest_pressure(results: "Results") -> float:
-    """Return the top of the colour scale, MPa: the largest pressure, 1 where there is none."""
+    """Return the upper end of the colour scale, MPa: the largest pressure, or 1 if it is zero."""
     assert results.maps is not None
     return float(np.nanmax(results.maps.pressure_Pa)) / MEGAPASCAL or 1.0
 
 
 def frame_maps(results: "Results", view: TopView) -> dict[str, Any]:
-    """Return what the page needs to draw any frame's pressure, JSON-able.
+    """Return the data with which the page draws the pressure of any frame, for JSON.
 
     Returns:
         picture: data address of a PNG that holds one tile per map.
         across: number of tiles side by side.
         rows, columns: size of a tile in bytes.
-        tile: number of the tile that each frame shows.
-        shown: frame to which this tile belongs, for each frame.
+        tile: index of the tile that each frame shows.
+        shown: for each frame, the frame in which the pressure of its tile was computed.
         edges: left, right, bottom and top of a tile, mm on the page.
         span: left, right, bottom and top of the drawn insert, mm on the page.
         rim: `FRAME_MAP.rim_byte`.
-        largest: MPa, top of the colour scale.
+        largest: upper end of the colour scale, MPa.
         colours: the colour scale, 256 hexadecimal colours in one string.
         centres: side -> centre of pressure of each frame, mm on the page; None: no contact.
     """
@@ -111,9 +111,9 @@ def frame_maps(results: "Results", view: TopView) -> dict[str, Any]:
 def _tiles(
     results: "Results", view: TopView, rows: list[int], largest: float
 ) -> tuple[NDArray[np.uint8], list[float]]:
-    """Return the bytes (frames, rows, columns) and the edges of a tile, mm.
+    """Return tiles (frames, rows, columns) and their left, right, bottom and top edge, mm.
 
-    A tile is cropped to the area that is in contact in any of the frames.
+    Tiles are cropped to the area that is in contact in any frame.
     """
     maps = results.maps
     assert maps is not None
@@ -132,7 +132,7 @@ def _tiles(
 
 
 def _png(tiles: NDArray[np.uint8], across: int) -> str:
-    """Return tiles, row by row, as a grey PNG in a data address."""
+    """Return all tiles side by side as the data address of a grey PNG."""
     count, rows, columns = tiles.shape
     down = -(-count // across)
     whole = np.zeros((down * across, rows, columns), np.uint8)

@@ -1,4 +1,4 @@
-"""The report's headline: a few cards and sentences, in plain words."""
+"""The headline of the report: cards with the main results."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -25,18 +25,19 @@ class HeadlineSettings:
     """Limits of the report's headline."""
 
     most_inputs: int = 2
-    """Number of inputs that a sentence names. Chosen: a sentence stays short."""
+    """Largest number of inputs in a sentence. Chosen because the sentence stays short."""
     most_muscles: int = 4
-    """Number of saturated muscles that a sentence names. Chosen: a sentence stays short."""
+    """Largest number of saturated muscles in a sentence. Chosen because the sentence stays
+    short."""
     notable_failed_share: float = 0.05
-    """1: share of failed samples above which the bands are cut off at one end. Chosen: fewer do not
-    move the 5th or 95th percentile far."""
+    """1: a larger share of failed samples is stated. Chosen because fewer failed samples hardly
+    move the 5th or 95th percentile."""
     residual_percent: float = 0.05
-    """% of the SI contact force: smaller residuals are not mentioned. Chosen: the tolerance of the
-    equilibrium leaves them."""
+    """% of the SI contact force: smaller residuals count as none. Chosen because they are within
+    the tolerance of the equilibrium."""
     distant_frames_deg: float = 5.0
-    """deg: if an event lies between frames that are farther apart than this, both frames are named.
-    Chosen: an event is read to some degrees."""
+    """deg: if the quadriceps begins to wrap between frames farther apart than this, the flexion of
+    both is stated. Chosen because readers need this flexion to a few degrees."""
 
 
 HEADLINE = HeadlineSettings()
@@ -45,7 +46,7 @@ OTHER_ERRORS = (
     "; this is the error of the contact model alone: errors of load, pose, shape and material add "
     "to it"
 )
-"""Text after a known error, which is less than the error of the result."""
+"""Text after a known error."""
 PRESSURE_AND_AREA = ("peak_pressure", "mean_pressure", "area")
 
 
@@ -57,7 +58,7 @@ class Card:
         title: name of the number.
         value: the number with its unit.
         detail: place in the motion, and meaning of the number.
-        warning: True: the card is highlighted as a warning.
+        warning: whether the card is highlighted as a warning.
     """
 
     title: str
@@ -71,7 +72,7 @@ class Card:
 
 
 def run_title(summary: Mapping[str, Any]) -> str:
-    """Return the title that a run's summary gives, or else the name of its scene."""
+    """Return the title in a run's summary, or a title made from the path of its scene."""
     if summary.get("title"):
         return str(summary["title"])
     scene = Path(str(summary.get("scene") or "tkamb run"))
@@ -120,7 +121,7 @@ def peak_words(peak: Mapping[str, Any]) -> str:
     """Return a peak force with its bands in words, body weights.
 
     Args:
-        peak: one entry of `peaks_BW` of the summary, or of its uncertainty, which has bands.
+        peak: entry of `peaks_BW` in the summary, or with bands in `uncertainty` of the summary.
     """
     if peak.get("p05") is None:
         return f"{peak['nominal']:.2f}"
@@ -131,7 +132,7 @@ def peak_words(peak: Mapping[str, Any]) -> str:
 
 
 def peaks_of(summary: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return name of a force -> its peak, with bands if inputs were varied."""
+    """Return name of a force -> entry for `peak_words`, with bands if inputs were varied."""
     varied = (summary.get("uncertainty") or {}).get("peaks_BW")
     return varied or summary.get("peaks_BW") or {}
 
@@ -142,7 +143,7 @@ def peak_legend(peaks: Mapping[str, Any]) -> str:
         return "with the inputs as given; `tkamb uncertainty` computes their uncertainty"
     words = "median of the samples (5 to 95 % by the inputs"
     if any(one.get("discrepancy_p05") is not None for one in peaks.values()):
-        words += "; 5 to 95 % by the inputs and by the discrepancy of the model"
+        words += "; 5 to 95 % by the inputs and by the discrepancy of the method"
     return words + ")"
 
 
@@ -166,7 +167,7 @@ def _peaks(results: "Results") -> Card | None:
 
 
 def _discrepancy(results: "Results") -> Card | None:
-    """Return the error of the method in measured knees; None if this knee was measured."""
+    """Return the error of the method in measured knees; None: unknown, or this knee is measured."""
     words = (results.summary.get("discrepancy") or {}).get("words")
     if not words or results.summary.get("measured"):
         return None
@@ -232,10 +233,10 @@ def _band(results: "Results", axis: HorizontalAxis) -> Card | None:
     for name, inside in table.get("measured_inside", {}).items():
         if inside["frames"]:
             more = inside.get("share_with_discrepancy")
-            both = "" if more is None else f", within that of inputs and discrepancy in {more:.0%}"
+            wide = "" if more is None else f", within the band with discrepancy in {more:.0%}"
             parts.append(
                 f"the measured {name} force lies within its band in {inside['share']:.0%} of "
-                f"{inside['frames']} frames{both}"
+                f"{inside['frames']} frames{wide}"
             )
     sampled = table.get("peak_force_total_BW")
     if sampled and sampled["median"] is None:
@@ -252,7 +253,7 @@ def _band(results: "Results", axis: HorizontalAxis) -> Card | None:
 
 
 def _largest(table: Mapping[str, Any], result: str) -> str:
-    """Return the inputs with the largest shares in a result's variance, in words."""
+    """Return the inputs with the largest shares of the variance of a result, in words."""
     shares = (table.get("shares_of_variance") or {}).get(result) or {}
     first = [(name, share) for name, share in shares.items() if name != "rest"][
         : HEADLINE.most_inputs
@@ -284,14 +285,14 @@ def _shares(results: "Results") -> Card | None:
         return None
     unknown = int(metrics.split_undetermined(results).sum())
     first = "equilibrium" if unknown and "equilibrium" in texts else next(iter(texts))
-    rest = [f"by {name} {text}" for name, text in texts.items() if name != first]
+    details = [f"by {name} {text}" for name, text in texts.items() if name != first]
     share = metrics.medial_share(results, "deformation" if "deformation" in texts else first)
     alone = int(((share <= 0) | (share >= 1)).sum())
-    rest += [f"one condyle is unloaded in {alone} frame{'s' * (alone > 1)}"] if alone else []
+    details += [f"one condyle is unloaded in {alone} frame{'s' * (alone > 1)}"] if alone else []
     apart = int((metrics.shares_apart(results) > AGREEMENT.share_difference).sum())
-    rest += [f"both estimates disagree in {apart} frame{'s' * (apart > 1)}"] if apart else []
-    rest += _adduction(results, unknown)
-    detail = "; ".join([f"by {first}, the remainder is lateral", *rest])
+    details += [f"both estimates disagree in {apart} frame{'s' * (apart > 1)}"] if apart else []
+    details += _adduction(results, unknown)
+    detail = "; ".join([f"by {first}, the remainder is lateral", *details])
     return Card("Medial share of the load", texts[first], detail, bool(alone or apart or unknown))
 
 
@@ -325,11 +326,11 @@ def _peak_pressure(results: "Results", axis: HorizontalAxis) -> Card | None:
 
 
 def _above_yield(results: "Results", first: str) -> str:
-    """Return how much of each condyle's area exceeds the yield stress, in words.
+    """Return the largest share of each condyle's area above the yield stress, in words.
 
     Args:
         results: results of a run.
-        first: side that is named first, the one whose pressure stands beside it.
+        first: side that is named first.
     """
     stress = results.summary.get("yield_stress_MPa")
     parts = []
@@ -346,7 +347,7 @@ def _above_yield(results: "Results", first: str) -> str:
 
 
 def _post(results: "Results", axis: HorizontalAxis) -> Card | None:
-    """Return the cam's largest force on the post and the pressure there, with [contact] post."""
+    """Return the peak force and pressure of the cam on the post; None: the post is not modelled."""
     result = metrics.peak(results, "post_force_N") if "post_force_N" in results.columns else None
     if result is None:
         return None
@@ -392,7 +393,12 @@ def _extensor(results: "Results", axis: HorizontalAxis) -> Card | None:
 
 
 def _wraps_from(results: "Results", first: float) -> str:
-    """Return where the quadriceps begins to wrap, as far as the frames show it."""
+    """Return in words the flexion at which the quadriceps begins to wrap the femur.
+
+    Args:
+        results: results of a run.
+        first: smallest flexion of a frame in which it wraps, deg.
+    """
     flexion, wrap = results["flexion_deg"], results["quadriceps_wrap_deg"]
     last = max(flexion[(wrap == 0.0) & (flexion < first)], default=first)
     if first - last > HEADLINE.distant_frames_deg:
@@ -408,10 +414,8 @@ def _residuals(results: "Results") -> Card | None:
     if {"ap", "ml", "axial_rotation"} <= set(released) and np.nanmax(
         share
     ) < HEADLINE.residual_percent:
-        at_rest = (
-            "AP, ML and axial rotation are released: equilibrium holds along these coordinates"
-        )
-        return Card("Residual force", "none", at_rest)
+        detail = "AP, ML and axial rotation are released: equilibrium holds along these coordinates"
+        return Card("Residual force", "none", detail)
     middle = f"{np.nanmedian(share):.1f} %"
     detail = f"median over the frames, at most {np.nanmax(share):.1f} %, of the SI contact force"
     change = 100 * metrics.residual_effect(results)

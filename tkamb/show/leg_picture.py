@@ -1,4 +1,4 @@
-"""A picture of the leg at three frames, in the laboratory, with the plate's force.
+"""A picture of the leg at three frames, in the laboratory frame, with the ground reaction.
 
 The rows show the whole leg from the lateral side and from the front, then the knee from both
 directions. The last row names the ligaments. The laboratory's y is up. Forward is the mean
@@ -129,9 +129,9 @@ def leg_frame(case: Case, mechanics: Mechanics, k: int) -> LegFrame:
 
 
 def _lines(mechanics: Mechanics, state: ChainState) -> list[tuple[Array, str, str]]:
-    """Return lines in the insert frame, with colour and name: ligaments, muscle, patellar ligament.
+    """Return ligaments, muscle and patellar ligament as points in the insert frame, colour, name.
 
-    Only the first strand of a ligament has its name.
+    The name is empty except for the first strand of a ligament.
     """
     segments: list[tuple[Array, str, str]] = []
     named: set[str] = set()
@@ -141,7 +141,7 @@ def _lines(mechanics: Mechanics, state: ChainState) -> list[tuple[Array, str, st
         segments.append((np.stack(bundle.ends(poses)), LIGAMENT, "" if name in named else name))
         named.add(name)
     if mechanics.extensor is not None:
-        with suppress(ComputationError):  # no patella is found in this frame; a run reports this
+        with suppress(ComputationError):  # the pose of the patella has no solution in this frame
             quadriceps, ligament = mechanics.extensor.lines.paths(state)
             segments.append((quadriceps.points, QUADRICEPS, ""))
             segments.append((ligament.points, PATELLAR_LIGAMENT, ""))
@@ -260,12 +260,7 @@ def _draw(axes: Axes, one: LegFrame, view: View, weight: float) -> None:
 def _name_sides(axes: Axes, view: View) -> None:
     """Label the anatomical directions to the left and to the right of the page."""
     ends = ((0.02, 0.015, "left", view.left), (0.98, 0.05, "right", view.right))
-    for (
-        place,
-        height,
-        align,
-        words,
-    ) in ends:  # the labels have two heights, because a leg from the front is narrow
+    for place, height, align, words in ends:  # two heights, because labels may overlap
         axes.text(
             place, height, words, ha=align, va="bottom", fontsize=8, color=GREY,
             transform=axes.transAxes, gid=f"side-{align}",
@@ -285,7 +280,7 @@ def _name_ligaments(axes: Axes, one: LegFrame, view: View) -> None:
 
 
 def _draw_surface(axes: Axes, surface: Surface, view: View, colour: str) -> None:
-    """Draw the triangles of a surface, the farthest first and those that face the reader lightest."""
+    """Draw a surface's triangles, farthest first. Those that face the reader are lightest."""
     lean = surface.face_normals @ view.towards
     facing = np.flatnonzero(lean > 0)
     corners = surface.triangles[facing]

@@ -1,4 +1,4 @@
-"""Pressure between a map's points, for pictures: the edge of contact, and a grid to draw on."""
+"""Pressure maps as pictures: interpolation onto a grid, and the edge of contact."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,13 +16,14 @@ class LevelSettings:
     """Conversion of a pressure map to a picture."""
 
     edge_tolerance: float = 1e-9
-    """Barycentric distance by which a grid point may lie outside a triangle, still on its edge.
-    Chosen: above rounding."""
+    """1: a grid point belongs to a triangle if no barycentric coordinate is below minus this.
+    Chosen because it is above rounding."""
     largest_gap: float = 10 * MILLIMETRE
-    """m: a larger gap, also an infinite one where nothing lies above, counts as this. Chosen: far
-    above any contact."""
+    """m: upper limit of gaps, also of infinite ones. Chosen because it is far above the gaps
+    beside a contact."""
     margin_points: int = 2
-    """Number of grid points kept around contacts. Chosen: the edge of a contact is drawn whole."""
+    """Number of grid points around the contacts. Chosen because the edge of contact is then drawn
+    whole."""
 
 
 LEVELS = LevelSettings()
@@ -31,24 +32,24 @@ LEVELS = LevelSettings()
 def pressure_levels(
     pressure: Array, gap: Array | None, triangles: NDArray[np.int64], peak: float
 ) -> Array:
-    """Return pressures as levels (f, n): up to 1 where loaded, negative where not.
+    """Return levels (f, n) for drawing: positive up to 1 in contact, negative outside.
 
-    A loaded point holds its share of `peak`. Between a loaded and an unloaded point the contact
-    ends where the level, drawn linearly, is zero: an unloaded point at the rim holds minus its
-    gap, scaled so that on average the rim lies halfway. At the points themselves the levels are
-    the data's.
+    The level of a loaded point is its pressure divided by `peak`. The picture interpolates levels
+    linearly, so the drawn contact ends where the level is zero. An unloaded point beside a loaded
+    one has a level proportional to minus its gap. On average the edge then lies halfway between
+    loaded and unloaded points.
 
     Args:
-        pressure: (f, n), any unit; NaN where the frame failed.
-        gap: (f, n) m, positive when apart; None: the rim lies halfway everywhere.
+        pressure: pressures (f, n), any unit; NaN in failed frames.
+        gap: gaps (f, n), m; None: unloaded points beside the contact have equal levels.
         triangles: (k, 3) indices into the points.
-        peak: top of the scale in the pressure's unit; a higher pressure has level 1.
+        peak: pressure of level 1, in the unit of `pressure`; higher pressures have level 1.
     """
     share = np.clip(np.nan_to_num(pressure) / (peak or 1.0), 0.0, 1.0)
     apart = (
         np.ones_like(share) if gap is None else np.clip(np.nan_to_num(gap), 0.0, LEVELS.largest_gap)
     )
-    touched = triangles[share.max(axis=0)[triangles].any(axis=1)]  # the others have no rim
+    touched = triangles[share.max(axis=0)[triangles].any(axis=1)]  # only these have an edge
     return np.stack(
         [_frame_levels(one, far, touched) for one, far in zip(share, apart, strict=True)]
     )
@@ -69,13 +70,13 @@ def _frame_levels(share: Array, apart: Array, triangles: NDArray[np.int64]) -> A
 
 
 class PageGrid:
-    """A regular grid over an insert as one looks down on it, in page coordinates (mm).
+    """A regular grid over an insert seen from above, in page coordinates (mm).
 
     Args:
-        points: (n, 3) m, insert frame.
-        triangles: (k, 3) indices.
-        sign: 1.0, or -1.0 where the page's right is insert -z.
-        step_mm: between the grid's points.
+        points: points (n, 3) of the insert's surface, m, insert frame.
+        triangles: (k, 3) indices into the points.
+        sign: 1.0: the page's right is insert +z; -1.0: it is insert -z.
+        step_mm: distance between neighbouring grid points, mm.
     """
 
     def __init__(
@@ -90,23 +91,24 @@ class PageGrid:
     def extent(
         self, rows: slice = slice(None), columns: slice = slice(None)
     ) -> tuple[float, float, float, float]:
-        """Return left, right, bottom and top edge of a part's outermost cells, mm."""
+        """Return left, right, bottom and top edge of the grid, or of a part of it, mm."""
         half = 0.5 * self._step
         across, up = self.across[columns], self.up[rows]
         return across[0] - half, across[-1] + half, up[-1] - half, up[0] + half
 
     @cached_property
     def _hits(self) -> tuple[NDArray[np.bool_], NDArray[np.int64], Array]:
-        """Which grid points (rows, columns) lie over the insert, its points there, weights."""
+        """Mask of grid points on the insert; indices and weights of three points for each of these.
+
+        The mask has the shape (rows, columns), the other two (m, 3).
+        """
         step = self._step
         row = (self.up[0] - self._points[:, 0] / MILLIMETRE) / step
         column = (self._sign * self._points[:, 2] / MILLIMETRE - self.across[0]) / step
         corners = np.stack([row, column], axis=1)[self._triangles]
         face, place, weights = _covered(corners, (len(self.up), len(self.across)))
         height = (weights * self._points[self._triangles[face], 1]).sum(axis=1)
-        order = np.argsort(
-            height, kind="stable"
-        )  # of triangles over each other the highest is visible
+        order = np.argsort(height, kind="stable")  # the highest triangle is the visible one
         ids = np.full(len(self.up) * len(self.across), -1)
         ids[place[order]] = order
         over = ids >= 0
@@ -115,13 +117,13 @@ class PageGrid:
         return over.reshape(shape), self._triangles[face[chosen]], weights[chosen]
 
     def sample(self, values: Array, every: int = 1) -> Array:
-        """Return values (..., n) of the points on the grid (..., rows, columns).
+        """Return fields interpolated linearly onto the grid (..., rows, columns).
 
-        Linear in a triangle. Rows run from the anterior edge down, columns to the page's right;
-        -1 off the insert.
+        Rows run from anterior to posterior, columns to the page's right. Grid points off the
+        insert hold -1.
 
         Args:
-            values: (..., n), one or more fields.
+            values: values (..., n) at the points, one or more fields.
             every: step between the rows and columns that are returned; 1: all.
         """
         over, corners, weights = self._hits
@@ -136,10 +138,11 @@ class PageGrid:
 
 
 def touched_part(touched: Mask) -> tuple[slice, slice]:
-    """Return the rows and columns of a grid that hold all that is touched, and a margin.
+    """Return the rows and columns of a grid that enclose the contact, with a margin.
 
     Args:
-        touched: (rows, columns); the first points where nothing is.
+        touched: mask (rows, columns) of grid points in contact. If it is empty, the result is a
+            few rows and columns at the first corner.
     """
     rows, columns = (_range(indices) for indices in np.nonzero(touched))
     return rows, columns
@@ -153,13 +156,13 @@ def _range(indices: NDArray[np.int64]) -> slice:
 def _covered(
     corners: Array, shape: tuple[int, int]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Return each pair of a triangle and a grid point that it covers.
+    """Return all pairs of a triangle and a grid point inside it.
 
-    A pair is the triangle's index, the point's flat index and its three barycentric weights.
+    The arrays hold the triangle's index, the point's flat index and its barycentric weights (3).
 
     Args:
-        corners: (k, 3, 2) rows and columns, in steps of the grid.
-        shape: rows and columns of the grid.
+        corners: corners (k, 3, 2) of the triangles, row and column, in steps of the grid.
+        shape: number of rows and of columns of the grid.
     """
     first = np.maximum(np.ceil(corners.min(axis=1) - LEVELS.edge_tolerance), 0.0).astype(np.int64)
     last = np.minimum(np.floor(corners.max(axis=1) + LEVELS.edge_tolerance), np.array(shape) - 1)
@@ -168,7 +171,7 @@ def _covered(
     row, column = first[face, 0] + rank // size[face, 1], first[face, 1] + rank % size[face, 1]
     a, b, c = np.moveaxis(corners[face], 1, 0)
     point = np.stack([row, column], axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):  # one seen from its side covers nothing
+    with np.errstate(divide="ignore", invalid="ignore"):  # a triangle seen edge-on has no area
         second, third = _area(a, point, c) / _area(a, b, c), _area(a, b, point) / _area(a, b, c)
     weights = np.stack([1.0 - second - third, second, third], axis=1)
     inside = weights.min(axis=1) >= -LEVELS.edge_tolerance

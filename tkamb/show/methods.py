@@ -1,7 +1,7 @@
-"""The Methods paragraph of a paper, from the summary of a run alone.
+"""The Methods paragraph of a paper, from the summary of a run.
 
-`methods(summary)` says what was modelled, by which equations and with which numbers, what was
-left out, which software did it, and what to cite. It reads `scene_tables` of summary.json.
+The paragraph states models, equations, numbers, parts that are not modelled, software and
+references. Its main source is `scene_tables` in summary.json.
 """
 
 import textwrap
@@ -15,10 +15,10 @@ from tkamb.run.columns import WITHOUT_MUSCLES
 
 @dataclass(frozen=True)
 class MethodsTextSettings:
-    """How `tkamb methods` prints its text."""
+    """Layout of the text of `tkamb methods`."""
 
     line_width: int = 92
-    """Letters per line. Chosen: a terminal and a mail show it without breaks."""
+    """Largest number of characters in a line. Chosen because terminals show it without breaks."""
 
 
 METHODS_TEXT = MethodsTextSettings()
@@ -105,8 +105,8 @@ class Methods:
     """A Methods paragraph.
 
     Args:
-        sentences: in order.
-        references: what to cite, sorted.
+        sentences: sentences of the paragraph.
+        references: cited publications, sorted.
     """
 
     sentences: tuple[str, ...]
@@ -129,7 +129,7 @@ def methods(summary: Mapping[str, Any]) -> Methods:
         summary: `results.summary`, or the content of summary.json.
 
     Raises:
-        InputError: the summary has no `scene_tables`, as before version 0.2.0.
+        InputError: the summary has no `scene_tables`. A version before 0.2.0 wrote it.
     """
     tables = summary.get("scene_tables")
     if not isinstance(tables, Mapping):
@@ -209,8 +209,8 @@ def _motion(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterator[s
         )
     count, failed = summary.get("frames"), len(summary.get("failed_frames", ()))
     if count:
-        lost = f"{failed} of them failed and are left out" if failed else "none of them failed"
-        yield f"{count} frames were computed; {lost}."
+        failures = f"{failed} of them failed and are left out" if failed else "none of them failed"
+        yield f"{count} frames were computed; {failures}."
 
 
 def _weights(markers: Mapping[str, Any]) -> str:
@@ -259,20 +259,20 @@ def _equations(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterato
 def _ligaments(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterator[str]:
     bundles = tables.get("ligament") or []
     for law, (words, source) in LAWS.items():
-        own = [bundle for bundle in bundles if bundle["law"] == law]
-        if own:
+        some = [bundle for bundle in bundles if bundle["law"] == law]
+        if some:
             yield (
                 f"Ligaments carried tension only: {words}, with L0 the slack length ({source}); "
-                f"{'; '.join(_ligament_words(bundle) for bundle in own)}."
+                f"{'; '.join(_ligament_words(bundle) for bundle in some)}."
             )
     generic = tables.get("generic_ligaments")
     if generic:
         words, source = LAWS["two-line"]
         yield (
-            "Generic bundles, nobody's own, were attached in proportion to the implant's width and "
-            f"carried tension only: {words}, with L0 the slack length ({source}); stiffness of "
-            "Abdel-Rahman 1998 and strain in extension of Blankevoort and Huiskes 1991: "
-            f"{'; '.join(_generic_words(generic['ligaments']))}."
+            "Generic bundles, not of this subject, were attached in proportion to the implant's "
+            f"width and carried tension only: {words}, with L0 the slack length ({source}); "
+            "stiffness of Abdel-Rahman 1998 and strain in extension of Blankevoort and Huiskes "
+            f"1991: {'; '.join(_generic_words(generic['ligaments']))}."
         )
     if not bundles and not generic:
         yield "No ligaments were modelled."
@@ -336,7 +336,7 @@ def _patella_words(motion: str) -> str:
         return "moved as recorded"
     return (
         "placed where it touches the femoral component with the patellar ligament at its length "
-        "and the moments in the sagittal plane in balance"
+        "and the moments in the sagittal plane in equilibrium"
     )
 
 
@@ -364,7 +364,7 @@ def _contact(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterator[
             f"{', '.join(contact['released'])}."
         )
     elif contact.get("coupling") == "points":
-        yield "Contact points and loads were iterated until both agreed."
+        yield "Contact points and loads were iterated until they converged."
     else:
         yield "The superior–inferior load was pressed in at the recorded rotation."
     error = summary.get("known_error")
@@ -384,7 +384,7 @@ MESH_NAMES = {"femoral": "femoral component", "insert": "insert", "patella": "pa
 
 
 def _mesh_words(measures: Mapping[str, Any]) -> Iterator[str]:
-    """Return sentences on meshes, thickness of the insert and tolerances of the contact solver."""
+    """Yield sentences on meshes, thickness of the insert and tolerances of the contact solver."""
     meshes = [
         f"{one['triangles']} triangles for the {MESH_NAMES.get(name, name)} "
         f"(median edge {one['edge_mm']:.2g} mm)"
@@ -413,7 +413,7 @@ def _mesh_words(measures: Mapping[str, Any]) -> Iterator[str]:
 
 def _material_words(contact: Mapping[str, Any], material: Mapping[str, Any]) -> str:
     if material:
-        from tkamb.io.given_material import material_in_words  # brings scipy
+        from tkamb.io.given_material import material_in_words  # imports scipy
 
         return f"The insert was of {material_in_words(material)}."
     if contact["material"] == "polyethylene":
@@ -439,7 +439,7 @@ def _changed(summary: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _notes(summary: Mapping[str, Any]) -> Iterator[str]:
-    """Return the scene's own notes: how its inputs were made, and what is assumed of them."""
+    """Yield the notes of the scene, on the origin of its inputs and on assumptions."""
     for note in summary.get("notes") or ():
-        if not note.startswith(WITHOUT_MUSCLES):  # `_extensor` says the same in a paper's words
+        if not note.startswith(WITHOUT_MUSCLES):  # `_extensor` has a sentence on this
             yield note if note.endswith((".", "!", "?")) else f"{note}."

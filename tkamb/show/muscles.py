@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 GROUP_COLOURS = (QUADRICEPS, *LIST, GREY, GREY)
 EXTERNAL, LIGAMENTS, POST, EXTENSORS = "external", "ligaments", "post", "quadriceps"
-"""Contributions beside those of single muscles."""
+"""Names of contributions of other loads, and of the quadriceps as a whole."""
 HELD = (
     "Contribution of a load to a force: the force that the equations of the frame give if this "
     "load acts alone. Pose, contact points, contact normals, direction of friction and lines of "
@@ -47,21 +47,21 @@ HELD = (
 
 @dataclass(frozen=True)
 class MuscleFigureSettings:
-    """Pictures of muscle activations."""
+    """Plots of muscle activations."""
 
     axis_top: float = 1.02
-    """Upper end of the axis of activations. Chosen: lines at 1 stay visible."""
+    """1: upper end of the axis of activations. Chosen because lines at 1 stay visible."""
 
 
 MUSCLE_FIGURE = MuscleFigureSettings()
 
 CELL, CELLS_ACROSS, MARGIN = (2.16, 1.12), 5, 0.3
-"""Inches: width and height of a small plot; how many stand beside each other; for the labels."""
+"""Width and height of a small plot, inches; number of plots in a row; height for labels, inches."""
 BETWEEN, LABELS = (11.5, 20.0), 10.0
-"""Points between two small plots, beside each other at least and below each other; for the
-horizontal axis' labels over an empty place."""
+"""Points: smallest horizontal and the vertical distance between small plots; height for axis labels
+above an incomplete last row."""
 FOOT, TITLE = 33.5, 11.5
-"""Points under all small plots, and over them."""
+"""Points: margin below and above all small plots."""
 SHADE = "#c4c4c4"
 
 
@@ -81,7 +81,7 @@ class Cell:
 
 
 def muscle_panels(results: "Results") -> tuple[Panel, ...]:
-    """Return the plots of the contributions to each condyle's force, and of the forces by group."""
+    """Return plots of the contributions to each condyle's force, and of muscle forces by group."""
     panels = (
         *(_contributions(results, side) for side in CONTRIBUTIONS),
         _forces(results),
@@ -116,8 +116,8 @@ def _contributions(results: "Results", side: str) -> Panel:
     shades = {EXTERNAL: GREY, LIGAMENTS: LIGAMENT, POST: BLACK} | colours
     lines = [Line("all", "all", scale * total, BLACK)]
     for k, (part, names) in enumerate(parts.items()):
-        own = (EXTENSORS,) if part == "knee extensors" else names
-        values = _sum(results, family, own)
+        loads = (EXTENSORS,) if part == "knee extensors" else names
+        values = _sum(results, family, loads)
         if np.isfinite(values).any():
             dashed = part in (EXTERNAL, LIGAMENTS, POST)
             label = labels.get(part, part)
@@ -127,14 +127,17 @@ def _contributions(results: "Results", side: str) -> Panel:
 
 
 def _sum(results: "Results", family: str, names: tuple[str, ...]) -> Array:
-    """Return the sum (f,) of a family's columns, of those that are there; NaN without any."""
+    """Return the sum (f,) of the existing columns of a family; NaN if none exists."""
     columns = [family_column(family, name) for name in names]
     present = [results[name] for name in columns if name in results.columns]
     return np.sum(present, axis=0) if present else np.full(len(results), np.nan)
 
 
 def activation_cells(results: "Results") -> list[Cell]:
-    """Return the small plots: each muscle across the knee, and the others by EMG channel."""
+    """Return the small plots: one per muscle of a knee group, and one per EMG channel of others.
+
+    A group is a knee group if one of its muscles crosses the knee.
+    """
     emg: Mapping[str, Any] = (results.summary.get("emg") or {}).get("muscles", {})
     cells: list[Cell] = []
     for group, names in _groups(results).items():
@@ -150,14 +153,18 @@ def activation_cells(results: "Results") -> list[Cell]:
                 channel = emg[name]["channel"]
                 channels[channel] = (*channels.get(channel, ()), name)
         cells += [
-            Cell(own[0] if len(own) == 1 else f"{channel} ({len(own)})", own, own[0])
-            for channel, own in channels.items()
+            Cell(
+                muscles[0] if len(muscles) == 1 else f"{channel} ({len(muscles)})",
+                muscles,
+                muscles[0],
+            )
+            for channel, muscles in channels.items()
         ]
     return cells
 
 
 def draw_activations(results: "Results", axis: HorizontalAxis) -> Figure | None:
-    """Return small plots of the activations, EMG shaded behind them; None without any."""
+    """Return small plots of activations over shaded EMG envelopes; None: no activations."""
     cells = activation_cells(results)
     if not cells:
         return None
@@ -179,7 +186,7 @@ def draw_activations(results: "Results", axis: HorizontalAxis) -> Figure | None:
 
 
 def _place_cells(cells: Sequence[Axes], rows: int) -> None:
-    """Put small plots beside and below each other, with room for what stands around them."""
+    """Place the small plots in rows, with room for the labels around them."""
     width, height = 72 * CELLS_ACROSS * CELL[0], 72 * (rows * CELL[1] + MARGIN)
     margin = LABEL_PLACE.edge_points + LABEL_PLACE.tick_points + label_width(cells[0].yaxis)
     beyond = overhang(cells[0].xaxis, width / CELLS_ACROSS - margin)
@@ -215,7 +222,7 @@ def _draw_cell(axes: Axes, cell: Cell, results: "Results", axis: HorizontalAxis)
 
 
 def _beyond(results: "Results", cell: Cell) -> str:
-    """Return in words how far an envelope exceeds the plot, above its normalising value."""
+    """Return the largest value of an EMG envelope that exceeds the plot in words; else ""."""
     if cell.envelope is None:
         return ""
     envelope = results[family_column(ENVELOPE, cell.envelope)]
@@ -224,7 +231,7 @@ def _beyond(results: "Results", cell: Cell) -> str:
 
 
 def _agreement(results: "Results", cell: Cell) -> str:
-    """Return Pearson's r of activation and envelope in words, the range over several muscles."""
+    """Return Pearson's r of activation and envelope in words; for several muscles its range."""
     emg: Mapping[str, Any] = (results.summary.get("emg") or {}).get("muscles", {})
     correlations = [emg[name]["pearson_r"] for name in cell.muscles if name in emg]
     correlations = [r for r in correlations if r is not None and np.isfinite(r)]

@@ -1,7 +1,7 @@
-"""Self-contained pages: their templates, and the security policy that blocks foreign scripts.
+"""Self-contained HTML pages: templates, and the security policy that blocks foreign scripts.
 
-The assets lie in the folder `assets` of the package that shows them. Text that is put into a
-template is escaped unless the template calls it safe.
+Templates, styles and scripts are in the folder `assets` of each package. Values in a template are
+escaped unless the template marks them as safe.
 """
 
 import base64
@@ -16,17 +16,17 @@ from markupsafe import Markup, escape
 
 
 def asset(package: str, name: str) -> str:
-    """Return the text of a style, script or page of a package."""
+    """Return the text of a file in the folder `assets` of a package."""
     return files(package).joinpath("assets", name).read_text(encoding="utf-8")
 
 
 def render(package: str, name: str, **values: Any) -> str:
-    """Return the page of a template.
+    """Return the page that a template makes from values.
 
     Args:
         package: package with the template, for example "tkamb.show".
-        name: file name in the folder assets of the package.
-        values: values of the names in the template; a missing value is an error.
+        name: file name in the folder `assets` of the package.
+        values: values of the names in the template. A missing value raises an error.
     """
     return _environment(package).get_template(name).render(values)
 
@@ -46,9 +46,9 @@ def _environment(package: str) -> Environment:
 
 
 def _unbroken(text: str) -> Markup:
-    """Return HTML in which numbers keep their units and ranges their ends on one line.
+    """Return HTML without line breaks between a number and its unit, or within a range.
 
-    Text between backticks, a command for example, is set as code.
+    Text between backticks becomes code.
     """
     html = re.sub(r"(\d) (%|BW|N|MPa|mm)(?!\w)", "\\1\u00a0\\2", str(escape(text)))
     html = re.sub(r"`([^`]+)`", r"<code>\1</code>", html)
@@ -56,13 +56,14 @@ def _unbroken(text: str) -> Markup:
 
 
 def policy_sources(*texts: str) -> str:
-    """Return inline scripts or styles as a content security policy names them: by SHA-256.
+    """Return the SHA-256 sources of inline scripts or styles for a content security policy.
+
+    Line ends count as \\n, as in browsers.
 
     Args:
-        texts: what stands between the tags, each whole. A browser reads line ends as \\n before
-            it hashes.
+        texts: complete text between the tags of each script or style.
 
-    Reference: W3C, Content Security Policy Level 3, section 2.3.1.
+    Source: W3C, Content Security Policy Level 3, section 2.3.1.
     """
     return " ".join(f"'sha256-{_digest(text)}'" for text in texts)
 

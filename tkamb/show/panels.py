@@ -39,11 +39,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PanelSettings:
-    """When one curve of a plot hides another."""
+    """Detection of curves that hide each other."""
 
     line_width_share: float = 0.005
-    """Of the curves' height: two that are nowhere farther apart are drawn over each other. Chosen:
-    a line is 1.5 points wide in a plot of 220."""
+    """1: two curves coincide if their largest distance is below this share of their height.
+    Chosen because a line is about 1.5 points wide in a plot of 220 points."""
 
 
 PANEL = PanelSettings()
@@ -58,11 +58,11 @@ class Line:
         label: name in the legend.
         values: (f,) values in the unit of the panel.
         colour: colour of the curve, "#rrggbb".
-        dashed: True: the curve is dashed.
-        band: (3, f) p05, p50 and p95 over the samples with varied inputs, in the unit of the panel;
-            None: no inputs were varied.
-        wide_band: (2, f) p05 and p95 with the discrepancy of the model added; None: unknown.
-        behind: True: the curve is drawn broad and pale behind the other curves.
+        dashed: whether the curve is dashed.
+        band: (3, f) 5th, 50th and 95th percentile of the samples, in the unit of the panel; None:
+            the run has no samples.
+        wide_band: (2, f) 5th and 95th percentile with the discrepancy of the method; None: unknown.
+        behind: whether the curve is drawn broad and pale behind the other curves.
     """
 
     name: str
@@ -88,10 +88,10 @@ class Panel:
         level: (value, label) of a horizontal reference line; None: no line.
         span: (low, high, label) of a shaded range behind the curves; None: no range.
         second: (factor, unit) of a second vertical axis on the right; None: no second axis.
-        logarithmic: True: the vertical axis is logarithmic.
-        from_zero: True: the vertical axis includes zero.
+        logarithmic: whether the vertical axis is logarithmic.
+        from_zero: whether the vertical axis includes zero.
         limits: ends of the vertical axis; None: they follow from the curves.
-        warning: True: the note is highlighted as a warning.
+        warning: whether the note is highlighted as a warning.
     """
 
     name: str
@@ -109,7 +109,7 @@ class Panel:
 
 
 def panels(results: "Results") -> tuple[Panel, ...]:
-    """Return the plots whose numbers the run has, in the report's order."""
+    """Return the plots that have numbers in this run, in the report's order."""
     makers: tuple[Callable[[Results], Panel], ...] = (
         _total, _condyles, _share, _sensitivity, _extensor, _ratios, _areas, _pressures, _yield,
         _post, _external, _ground, _ligaments, _residuals, _residual_moment, _hip_force,
@@ -120,13 +120,13 @@ def panels(results: "Results") -> tuple[Panel, ...]:
 
 
 def _without_empty_lines(panel: Panel) -> Panel:
-    """Return the panel with only the lines that hold a number, none of them hidden."""
+    """Return the panel without lines that hold only NaN. Lines over others are dashed."""
     lines = tuple(line for line in panel.lines if np.isfinite(line.values).any())
     return replace(panel, lines=_none_hidden(lines))
 
 
 def _none_hidden(lines: Sequence[Line]) -> tuple[Line, ...]:
-    """Return the lines, dashed where one would be drawn exactly over an earlier one."""
+    """Return the lines. A line that would hide an earlier one is dashed."""
     shown: list[Line] = []
     for line in lines:
         covers = any(_coincide(line.values, earlier.values) for earlier in shown)
@@ -135,13 +135,13 @@ def _none_hidden(lines: Sequence[Line]) -> tuple[Line, ...]:
 
 
 def _coincide(values: Array, others: Array) -> bool:
-    """Say whether two curves (f,) cannot be told apart where both have numbers."""
-    both = np.isfinite(values) & np.isfinite(others)
-    if not both.any():
+    """Return whether two curves (f,) coincide in all frames that have both."""
+    finite = np.isfinite(values) & np.isfinite(others)
+    if not finite.any():
         return False
-    height = float(np.ptp(np.concatenate([values[both], others[both]])))
-    apart = float(np.abs(values - others)[both].max())
-    return apart <= PANEL.line_width_share * height
+    height = float(np.ptp(np.concatenate([values[finite], others[finite]])))
+    distance = float(np.abs(values - others)[finite].max())
+    return distance <= PANEL.line_width_share * height
 
 
 def _line(
@@ -206,8 +206,8 @@ def _condyles(results: "Results") -> Panel:
         *(_measured(results, s, f"{s}, measured", colour) for s, colour in SIDE_COLOURS.items()),
     )
     note = (
-        "Deformation: the contact model carries the total load at the measured rotation. "
-        "Equilibrium: from the balance of coronal moments."
+        "Deformation: the contact model presses with the total load at the recorded adduction. "
+        "Equilibrium: from the equilibrium of coronal moments."
     )
     return Panel("condyles", "Medial and lateral force, two estimates", "BW", lines, note)
 
@@ -344,9 +344,9 @@ def _ligaments(results: "Results") -> Panel:
     names = [name for name in results.columns if is_ligament(name)]
     bundles: dict[str, list[str]] = {}
     for name in names:
-        own = ligament_of(name)
-        bundle = own.rstrip("0123456789").rstrip("_") if len(names) > len(LIST) else own
-        bundles.setdefault(bundle or own, []).append(name)
+        strand = ligament_of(name)
+        bundle = strand.rstrip("0123456789").rstrip("_") if len(names) > len(LIST) else strand
+        bundles.setdefault(bundle or strand, []).append(name)
     lines = tuple(
         _bundle(results, bundle, strands, k) for k, (bundle, strands) in enumerate(bundles.items())
     )
@@ -360,7 +360,7 @@ def _ligaments(results: "Results") -> Panel:
 
 
 def _bundle(results: "Results", bundle: str, strands: Sequence[str], position: int) -> Line:
-    """Return the summed tension of strands; NaN only where all of them are."""
+    """Return the summed tension of strands. It is NaN in frames where all strands are NaN."""
     tension = np.array([results[name] for name in strands])
     missing = np.isnan(tension).all(axis=0)
     values = np.where(missing, np.nan, np.nansum(tension, axis=0))

@@ -34,32 +34,33 @@ if TYPE_CHECKING:
 WIDTH, HEIGHT = 5.4, 3.1
 DEFAULT = ("forces", "condyles", "ratios", "pressures")
 TITLE_PAD, LEGEND_ROW = 8.0, 14.0
-"""Points: distance of a plot from its title, and what each row of the legend adds to it."""
+"""Points: distance of a plot from its title, without a legend and per row of the legend."""
 FOOT, OVERHANG, AXIS_LABEL = 31.5, 13.0, 13.0
-"""Points around a plot: for the labels of the horizontal axis; for half of its last label; for the
-vertical axis' label."""
+"""Points: height of the labels under a plot; half the width of the last tick label; width of the
+label of the vertical axis."""
 SIDE_LABEL, LEGEND = 8.0, 8.5
 """Points: font sizes of the labels beside a plot and of the legend."""
 
 
 @dataclass(frozen=True)
 class PlotSettings:
-    """Looks of the report's plots."""
+    """Style of the report's plots."""
 
     label_offset_points: float = 12.0
-    """Points from a plot's edge to the near side of an axis' label. Chosen by eye."""
+    """Points: distance of an axis label from the edge of the figure. Chosen by eye."""
     side_gap: float = 0.01
-    """1: gap between axes and the text beside them, as a share of the width. Chosen by eye."""
+    """1: gap between axes and the text beside them, as a share of the figure's width. Chosen by
+    eye."""
     band_opacity: float = 0.16
     """1: opacity of the band around a line, 0 to 1. Chosen by eye."""
     wide_band_opacity: float = 0.07
-    """1: opacity of the band that includes the model's discrepancy, 0 to 1. Chosen by eye."""
+    """1: opacity of the band that includes the discrepancy, 0 to 1. Chosen by eye."""
 
 
 PLOT = PlotSettings()
 
 HANDLE, COLUMN_GAP = 2.7, 1.4
-"""In font sizes of the legend: width of a handle with its gap, and the gap between columns."""
+"""Width of a legend handle with its gap, and gap between columns, in font sizes of the legend."""
 DASHES = (0, (4, 2))
 SPAN = "#e2e2e2"
 STANCE = "#eef3f7"
@@ -68,8 +69,8 @@ STANCE = "#eef3f7"
 class Sheet:
     """A figure on which the plots of a run are drawn one after the other.
 
-    Axes and ticks take most of the time of a plot, so they are reused and only the curves are
-    replaced. A plot that `_place_alone` cannot place has a figure of its own.
+    Axes and ticks are reused, because they take most of the time of a plot. A plot that
+    `_place_alone` cannot place has a separate figure.
 
     Args:
         results: results of the run.
@@ -82,9 +83,10 @@ class Sheet:
         self._axes = self._new_axes()
 
     def draw(self, panel: Panel) -> Figure:
-        """Return one plot with its flagged and failed frames marked along the bottom.
+        """Return a plot with marks of flagged and failed frames along the bottom.
 
-        Each curve's id in the picture is its line's name. The figure is valid until the next plot.
+        The SVG id of a curve is "line-" and the name of its line. The figure is valid until the
+        next call.
         """
         with settings():
             self._clear()
@@ -121,13 +123,13 @@ def plot(results: "Results", names: tuple[str, ...] = (), axis: str | None = Non
     """Return the plots of a run in one figure, for notebooks.
 
     Args:
-        results: the run.
-        names: panels by their ids in the report ("forces", "condyles", "pressures", ...);
-            default: forces, condyles, ratios and pressures, as far as the run has them.
-        axis: "flexion", "cycle" or "time"; default: as the scene asks.
+        results: results of a run.
+        names: names of panels in the report ("forces", "condyles", "pressures", ...). Default:
+            forces, condyles, ratios and pressures, if the run has them.
+        axis: "flexion", "cycle" or "time"; default: the axis of the run.
 
     Raises:
-        InputError: a plot or an axis that does not exist.
+        InputError: a plot or the axis does not exist.
     """
     by_name = {panel.name: panel for panel in (*panels(results), centre_panel(results))}
     unknown = [name for name in names if name not in by_name]
@@ -153,10 +155,10 @@ def plot(results: "Results", names: tuple[str, ...] = (), axis: str | None = Non
 
 
 def _place_alone(axes: Axes, panel: Panel) -> bool:
-    """Give a plot that stands alone the room that its labels need; say whether that was possible.
+    """Place the axes of a plot so that its labels fit. Return whether this was possible.
 
-    The places are those of matplotlib's constrained layout, which is slow. That layout is still
-    used for plots with a power of ten above a vertical axis or with a legend that is too wide.
+    The result equals matplotlib's constrained layout, which is slow. It is impossible with a power
+    of ten above a vertical axis, or with a legend that is too wide.
     """
     for second in axes.child_axes:
         second.apply_aspect()  # the second axis takes its range from the first
@@ -196,7 +198,7 @@ def _place_alone(axes: Axes, panel: Panel) -> bool:
 
 
 def _legend_width(panel: Panel, columns: int) -> float:
-    """Return the width (points) of the legend of `legend_above`."""
+    """Return the width of the legend made by `legend_above`, points."""
     texts = [text_width(line.label, LEGEND) for line in panel.lines]
     rows = -(-len(texts) // columns)
     wide = [max(texts[k : k + rows]) for k in range(0, len(texts), rows)]
@@ -204,7 +206,7 @@ def _legend_width(panel: Panel, columns: int) -> float:
 
 
 def mark_frames(axes: Axes, results: "Results", axis: HorizontalAxis) -> None:
-    """Mark flagged frames with ticks and failed ones with crosses along the bottom."""
+    """Mark flagged frames with ticks and failed frames with crosses along the bottom."""
     transform = axes.get_xaxis_transform()
     for mask, marker, colour, name in (
         (flagged(results), "|", ORANGE, "flagged"),
@@ -256,7 +258,7 @@ def _draw_band(axes: Axes, line: Line, axis: HorizontalAxis) -> None:
 
 
 def _legend_columns(panel: Panel) -> int:
-    """Return how many legend entries stand beside each other."""
+    """Return the number of columns of the legend."""
     return 2 if sum(len(line.label) + 6 for line in panel.lines) > 72 else 4
 
 
@@ -316,12 +318,12 @@ def _draw_span(axes: Axes, low: float, high: float, label: str) -> None:
 
 
 def _draw_second(axes: Axes, factor: float, unit: str) -> None:
-    def there(value: Any) -> Any:
+    def to_second(value: Any) -> Any:
         return np.asarray(value, float) * factor
 
-    def back(value: Any) -> Any:
+    def to_first(value: Any) -> Any:
         return np.asarray(value, float) / factor
 
-    right = axes.secondary_yaxis("right", functions=(there, back))
+    right = axes.secondary_yaxis("right", functions=(to_second, to_first))
     right.set_ylabel(unit)
     right.spines["right"].set_visible(True)

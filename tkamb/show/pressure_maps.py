@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PressurePictureSettings:
-    """Looks of the pressure maps."""
+    """Style of the pressure maps."""
 
     margin_mm: float = 2.0
     """mm: margin around the insert in a picture. Chosen by eye."""
@@ -64,7 +64,7 @@ BAR_LABELS, BAR_RATIO = 41.0, 30.0
 
 
 class TopView:
-    """The insert from above, in page coordinates (mm; to the right and up).
+    """The insert from above, in page coordinates: mm to the right and up.
 
     Args:
         maps: pressure maps with their points and triangles.
@@ -91,8 +91,8 @@ class TopView:
     def insert_picture(self) -> tuple[Array, Array]:
         """Return grey level and opacity (rows, columns) of the insert, on a grid with a margin.
 
-        The rim of the map's triangles has steps. The outline is smoother: on it the signed distance
-        from the rim, averaged over about one triangle, is zero.
+        The edge of the map has steps. Its outline is smoothed: the signed distance from the edge is
+        averaged over about one triangle, and the outline is where this average is zero.
         """
         from scipy.ndimage import distance_transform_edt, gaussian_filter  # takes 0.1 s to load
 
@@ -218,9 +218,15 @@ def draw_map(
 
 
 def place_maps(figure: Figure, down: int, across: int, gap: float) -> tuple[list[Axes], Axes]:
-    """Return the axes of maps, row by row, and of their colour bar, `gap` points beside them.
+    """Return the axes of maps, row by row, and the axes of their colour bar to the right.
 
     No layout engine is needed, because the sizes of the labels are known.
+
+    Args:
+        figure: empty figure.
+        down: number of rows.
+        across: number of maps in a row.
+        gap: distance between maps and colour bar, points.
     """
     figure.set_layout_engine("none")
     width, height = 72 * figure.get_size_inches()
@@ -259,9 +265,8 @@ def draw_paths(
         for side, colour in SIDE_COLOURS.items():
             x, y = view.page_coordinates(results[f"{side}_cop_ap_mm"], results[f"{side}_cop_ml_mm"])
             parts = stretches(np.column_stack([x, y]) * MILLIMETRE)
-            apart = np.full(len(x), np.nan)
             for number, part in enumerate(parts):
-                line = apart.copy()
+                line = np.full(len(x), np.nan)
                 line[part] = x[part]
                 name = f"path-{side}" + (f"-{number}" if number else "")
                 axes.plot(line, y, color=colour, linewidth=1.6, gid=name)
@@ -277,7 +282,7 @@ def _pressure(results: "Results") -> Array:
 
 
 def _edge_length_mm(points: Array, triangles: NDArray[np.int64]) -> float:
-    """Return the median length of the triangles' edges."""
+    """Return the median length of the triangles' edges, mm."""
     edges = points[triangles] - points[np.roll(triangles, 1, axis=1)]
     return float(np.median(np.linalg.norm(edges, axis=-1))) / MILLIMETRE
 
@@ -299,7 +304,7 @@ def _shade(points: Array, triangles: NDArray[np.int64]) -> Array:
 def draw_pressure(
     axes: Axes, view: TopView, pressure: Array, scale: Normalize, gap: Array | None = None
 ) -> None:
-    """Colour the insert with a pressure (n,), in the scale's unit.
+    """Draw the pressure of one frame over the insert.
 
     Args:
         axes: axes that show the insert.
@@ -351,7 +356,7 @@ def _caption(results: "Results", axis: HorizontalAxis, frame: int) -> str:
 def _label_stops(
     axes: Axes, x: Array, y: Array, axis: HorizontalAxis, frames: Sequence[int], colour: str
 ) -> None:
-    """Label the dots, the first and the last point of a path with their place in the motion."""
+    """Draw dots at both ends and at `frames` of a path, labelled with the position on the axis."""
     finite = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if not len(finite):
         return
@@ -377,7 +382,7 @@ def _label_stops(
 
 
 def _spread(heights: Array, step: float) -> Array:
-    """Return rising heights, moved apart so that neighbours differ by at least `step`."""
+    """Return increasing heights, moved apart so that neighbours differ by at least `step`."""
     count = np.arange(len(heights))
-    pressed = np.maximum.accumulate(heights - step * count) + step * count
-    return pressed - 0.5 * float(np.mean(pressed - heights))
+    raised = np.maximum.accumulate(heights - step * count) + step * count
+    return raised - 0.5 * float(np.mean(raised - heights))

@@ -1,7 +1,7 @@
-"""The report: one self-contained page, for a biomechanist to read in a minute.
+"""The report of a run: one self-contained HTML page.
 
-Its frame slider moves one cursor in every plot; the numbers of the frames are in the page as JSON,
-rounded to five digits. Without scripts, and on paper, the page can be read without the cursor.
+A slider selects a frame and moves a cursor in every plot. The page holds the values of all frames
+as JSON, rounded to five digits. Without scripts, and on paper, the page has no cursor.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -34,11 +34,11 @@ POLICY = (
     "default-src 'none'; script-src {script}; style-src-elem {style}; "
     "style-src-attr 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
 )
-"""The page runs its own script and loads nothing; the plots set their colours in attributes."""
+"""Security policy: the browser runs only the page's script and loads nothing from elsewhere."""
 THIRD = 2 / 3 * WIDTH
-"""Inches: width of a plot of which three stand beside each other, at the same size of letters."""
+"""Inches: width of a plot in a row of three."""
 SCRIPTS = ("cursor.js", "units.js", "insert.js", "downloads.js", "start.js")
-"""In the order in which they stand in the page."""
+"""Scripts of the page, in their order."""
 COLOURS = (
     "Lines run in time order. In every plot blue is medial, red is lateral and black is the total. "
     "Violet is superior–inferior, teal is anterior–posterior and olive is medial–lateral. A moment "
@@ -48,11 +48,11 @@ COLOURS = (
 PROVENANCE = (
     "scene", "scene_sha256", "started", "command", "versions", "seconds", "contact", "frame",
 )  # fmt: skip
-"""Keys of the summary that are shown as they are."""
+"""Keys of the summary that the page shows unchanged."""
 
 
 def write_report(results: "Results", path: str | Path) -> None:
-    """Write the report of a run as one self-contained HTML page, whole or not at all.
+    """Write the report of a run as one self-contained HTML page.
 
     Raises:
         InputError: the folder cannot be written, or the summary lacks the body mass.
@@ -61,7 +61,7 @@ def write_report(results: "Results", path: str | Path) -> None:
 
 
 def report_html(results: "Results", progress: Progress = lambda drawn: drawn) -> str:
-    """Return the report as HTML: vector plots, pictures and style are inside the page.
+    """Return the report as a self-contained HTML page.
 
     Args:
         results: results of a run.
@@ -101,7 +101,7 @@ def report_html(results: "Results", progress: Progress = lambda drawn: drawn) ->
 
 
 def headline_html(results: "Results") -> str:
-    """Return the headline numbers alone, with their style, for notebooks."""
+    """Return the headline numbers as HTML with their style, for notebooks."""
     return render(
         PACKAGE,
         "notebook.html",
@@ -189,7 +189,7 @@ def _legend(results: "Results", axis: HorizontalAxis) -> list[str]:
         sentences.append(f"{words}.")
     if results.band_with_discrepancy("force_total_N") is not None:
         sentences.append(
-            "Paler and wider: 5 to 95 % with the discrepancy of the model added, which was "
+            "Paler and wider: 5 to 95 % with the discrepancy of the method added, which was "
             "estimated from measured knees."
         )
     if flagged(results).any():
@@ -200,7 +200,7 @@ def _legend(results: "Results", axis: HorizontalAxis) -> list[str]:
 
 
 def _sentences(summary: dict[str, Any]) -> list[str]:
-    """Return the notes for the reader, one sentence each, without repeats."""
+    """Return residuals, notes, assumptions and parts not modelled as sentences, each once."""
     result: list[str] = []
     for key in ("residuals", "notes", "assumptions"):
         value = summary.get(key) or []
@@ -212,7 +212,7 @@ def _sentences(summary: dict[str, Any]) -> list[str]:
 
 
 def _provenance(summary: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return the provenance of the run: name and text."""
+    """Return name and value, as text, of each key in `PROVENANCE`."""
     return [
         (key.replace("_", " ").replace("sha256", "SHA-256"), _text(summary[key]))
         for key in PROVENANCE
@@ -232,7 +232,7 @@ def _text(value: Any) -> str:
 
 
 def _cursor_data(results: "Results", axis: HorizontalAxis) -> dict[str, Any]:
-    """Return what the slider shows of each frame: position, status, the lines of every plot."""
+    """Return the data of the slider: position, status and values of all curves in each frame."""
     drawn = (*panels(results), centre_panel(results))
     if results.summary.get("muscle_groups"):
         from tkamb.show.muscles import muscle_panels
@@ -255,7 +255,10 @@ def _cursor_data(results: "Results", axis: HorizontalAxis) -> dict[str, Any]:
 
 
 def _cursor_lines(panel: Panel) -> list[dict[str, Any]]:
-    """Return a panel's lines with as many decimals as show a thousandth of its largest value."""
+    """Return the curves of a panel, with the number of decimals to show.
+
+    The decimals resolve about a hundredth to a thousandth of the panel's largest value.
+    """
     largest = max(float(np.nanmax(np.abs(line.values))) for line in panel.lines)
     digits = int(np.clip(2 - np.floor(np.log10(largest)), 0, 4)) if largest > 0 else 0
     return [

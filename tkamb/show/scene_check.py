@@ -1,4 +1,4 @@
-"""Check of a scene before anything is run: content of each file, and implausible values."""
+"""Check of a scene before a run: content of each file, and implausible values."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -33,11 +33,11 @@ ANGLES = ("flexion", "adduction", "axial_rotation")
 
 @dataclass(frozen=True)
 class InventorySettings:
-    """What `tkamb check` lists."""
+    """Limits of the list that `tkamb check` prints."""
 
     high_strain: float = 0.1
-    """1: strain from which a bundle is listed. Chosen: ligaments of the knee rupture at 12 to 20
-    %."""
+    """1: ligament bundles with a larger strain are listed. Chosen because ligaments of the knee
+    rupture at 12 to 20 %."""
 
 
 INVENTORY = InventorySettings()
@@ -118,7 +118,7 @@ def _motion(case: Case) -> Entry:
 
 
 def _in_words(case: Case) -> str:
-    """Return what the signs of AP and axial rotation mean, between least and most flexion."""
+    """Return AP and axial rotation from least to most flexion in words, to check their signs."""
     motion = case.motion
     if {"ap", "axial_rotation"} & set(motion.unrecorded):
         return ""
@@ -135,7 +135,7 @@ def _in_words(case: Case) -> str:
 
 
 def _shank(case: Case) -> Entry:
-    """Return how the shank stands: its lean is that of the tibia's long axis."""
+    """Return the forward lean of the tibia's long axis and the height of the ankle."""
     if case.tibia is None:
         raise ValueError("a shank that was read has a motion")
     up = case.tibia.pose[:, :3, 1]
@@ -180,7 +180,7 @@ def _surface(surface: Surface) -> str:
 
 
 def _ligaments(mechanics: Mechanics) -> Entry:
-    """Return the bundles, and those with a high strain and where: the strains of the report."""
+    """Return the bundles, the range of their strains, and the high strains with their flexion."""
     strains = mechanics.strains
     strained = [
         f"{name} {100 * value:.0f} % at {flexion:.0f} deg"
@@ -198,13 +198,14 @@ def _ligaments(mechanics: Mechanics) -> Entry:
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Return names by commas; three or more that count up one by one as first–last."""
+    """Return names separated by commas. MCL1, MCL2, MCL3 are abbreviated as MCL1–3."""
     text: list[str] = []
     for stem, group in groupby(names, lambda name: name.rstrip("0123456789")):
-        own = list(group)
-        first, last = own[0][len(stem) :], own[-1][len(stem) :]
+        members = list(group)
+        first, last = members[0][len(stem) :], members[-1][len(stem) :]
         counted = [f"{stem}{k}" for k in range(int(first), int(last) + 1)] if first and last else []
-        text += [f"{own[0]}–{last}"] if len(own) > 2 and own == counted else own
+        abbreviate = len(members) > 2 and members == counted
+        text += [f"{members[0]}–{last}"] if abbreviate else members
     return ", ".join(text)
 
 
@@ -225,7 +226,7 @@ def _contact(case: Case) -> Entry:
 
 
 def _measured(measured: "MeasuredForce", weight: float) -> Entry:
-    """Return what an instrumented implant measured: compared with a run, never used in it."""
+    """Return the forces that an instrumented implant measured."""
     forces = [
         _range(name, values[np.isfinite(values)] / weight, "BW", 2)
         for name, values in measured.force.items()
@@ -251,16 +252,15 @@ class SceneCheck:
     """Content of a scene, parts that are not modelled, and questions.
 
     Args:
-        scene: its file.
-        case: the scene with its files read.
-        mechanics: its body side, prepared.
+        scene: path of the scene file.
+        case: content of the scene and its files.
+        mechanics: model of the leg, muscles and ligaments.
         entries: content of each file and table.
-        not_modelled: parts that the scene leaves out.
+        not_modelled: names of parts that the scene leaves out.
         assumptions: assumptions of the results.
         questions: unlikely values, with the likely mistake.
-        answered: questions that the scene answers.
-        missing: packages that a run needs and that are not installed, with the command to install
-        them.
+        answered: lines on questions that the scene answers.
+        missing: messages on packages that a run needs and that are not installed.
     """
 
     scene: Path
@@ -287,7 +287,7 @@ class SceneCheck:
         ]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what `tkamb check --json` prints."""
+        """Return the output of `tkamb check --json`."""
         motion = self.case.motion
         return {
             "scene": str(self.scene),
@@ -310,17 +310,17 @@ def check_scene(
     overrides: dict[str, Any] | None = None,
     begin: Callable[[str], None] = lambda stage: None,
 ) -> SceneCheck:
-    """Read every file of a scene and ask about unlikely values; nothing is run.
+    """Read a scene with its files and check them for unlikely values, without a run.
 
-    The contact model is made, but not prepared: a mesh that it cannot use is found by a run.
+    Meshes are not checked for use by the contact model. Only a run does this.
 
     Args:
         path: path of the scene file.
-        overrides: dotted key -> value, as `tkamb.load_scene` takes them.
-        begin: called with the name of each stage.
+        overrides: dotted scene key -> value, see `tkamb.load_scene`.
+        begin: function that is called with the name of each stage.
 
     Raises:
-        InputError: what `tkamb run` would refuse of the scene and its files.
+        InputError: the scene or one of its files is invalid.
     """
     begin("reading the scene and its files")
     scene = load_scene(path, overrides)
@@ -346,7 +346,7 @@ def check_scene(
 
 
 def _missing(case: Case) -> tuple[str, ...]:
-    """Return the packages that a run of the case needs and that are not installed."""
+    """Return a message for each package that the run needs and that is not installed."""
     if not case.scene.muscles:
         return ()
     from tkamb.run.muscles.sharing import solver_is_installed, solver_missing
@@ -355,8 +355,8 @@ def _missing(case: Case) -> tuple[str, ...]:
 
 
 def _beyond(case: Case) -> list[str]:
-    """Return the parts that no table of a scene can model, as far as they concern this scene."""
-    others = [] if case.scene.muscles else ["muscles other than the quadriceps"]
+    """Return further parts of the knee that this scene does not model."""
+    muscles = [] if case.scene.muscles else ["muscles other than the quadriceps"]
     patella = ["out-of-plane motion of the patella"] if case.scene.patella else []
     post = [] if case.post is not None else ["cam–post contact"]
-    return [*others, *patella, *post, "wear and creep (`tkamb wear`)"]
+    return [*muscles, *patella, *post, "wear and creep (`tkamb wear`)"]

@@ -31,20 +31,20 @@ ALWAYS_NOT = "Results of another patient, trial or day: this run has one knee in
 
 
 def conclusions(results: "Results") -> tuple[list[str], list[str]]:
-    """Return the supported and the unsupported conclusions of a run, one sentence each."""
+    """Return the conclusions that a run supports, and those that it does not support."""
     sentences = (
         _conclude_force(results),
         _conclude_split(results),
         _conclude_pressure(results),
         _conclude_certainty(results),
     )
-    bears = [words for good, _ in sentences for words in good]
-    bears_not = [words for _, bad in sentences for words in bad]
+    supported = [words for good, _ in sentences for words in good]
+    unsupported = [words for _, bad in sentences for words in bad]
     questions = len(results.summary.get("questions") or [])
     if questions:
         many = "questions above are" if questions > 1 else "question above is"
-        bears_not.insert(0, f"Any conclusion, before the {many} answered.")
-    return bears, [*bears_not, ALWAYS_NOT]
+        unsupported.insert(0, f"Any conclusion, before the {many} answered.")
+    return supported, [*unsupported, ALWAYS_NOT]
 
 
 def _conclude_force(results: "Results") -> tuple[list[str], list[str]]:
@@ -80,7 +80,7 @@ def _conclude_force(results: "Results") -> tuple[list[str], list[str]]:
 
 
 def _compared(results: "Results") -> dict[str, Any]:
-    """Return the comparison of each force that was measured in some frame."""
+    """Return name of a measured force -> its comparison, if any frame was compared."""
     result = results.summary.get("measured") or {}
     return {name: one for name, one in result.items() if one["frames_compared"]}
 
@@ -113,18 +113,18 @@ def _conclude_pressure(results: "Results") -> tuple[list[str], list[str]]:
     error = results.summary.get("known_error")
     if error is None:
         return [], ["Pressures and areas: contact is not modelled."]
-    bears = [
+    supported = [
         "Whether the pressure rises or falls with another design, pose or setting that is computed "
         "in the same way."
     ]
     if isinstance(error, str):
-        return bears, [f"Pressures and areas as absolute values: their error is {error}."]
+        return supported, [f"Pressures and areas as absolute values: their error is {error}."]
     words = (
         f"{known_error_words(error, PRESSURE_AND_AREA)}; errors of load, pose and shape add to it"
     )
     if is_large(error, PRESSURE_AND_AREA):
-        return bears, [f"Pressures and areas as absolute values: {words}."]
-    return [f"Pressures and areas of unworn surfaces: {words}.", *bears], []
+        return supported, [f"Pressures and areas as absolute values: {words}."]
+    return [f"Pressures and areas of unworn surfaces: {words}.", *supported], []
 
 
 def _conclude_certainty(results: "Results") -> tuple[list[str], list[str]]:
@@ -134,7 +134,7 @@ def _conclude_certainty(results: "Results") -> tuple[list[str], list[str]]:
 
 
 def _frame_count(chosen: Mask) -> str:
-    """Return how many frames of a run (f,) are chosen, in words."""
+    """Return in words how many frames of a mask (f,) are True."""
     count = int(chosen.sum())
     if count == len(chosen):
         return "any frame" if count > 1 else "the frame"
@@ -142,7 +142,7 @@ def _frame_count(chosen: Mask) -> str:
 
 
 Entry = tuple[str, str, Array, int]
-"""Heading, unit, values (f,), digits."""
+"""Heading, unit, values (f,), number of decimals."""
 
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 
@@ -152,8 +152,8 @@ class TextTable:
     """A table of texts.
 
     Args:
-        headings: one per column, a name or (name, unit).
-        rows: cells of each row; a row of strains begins with one more cell, the name of the bundle.
+        headings: heading of each column, a name or (name, unit).
+        rows: cells of each row. In a table of strains, the name of the bundle comes first.
     """
 
     headings: Sequence[Any]
@@ -161,7 +161,7 @@ class TextTable:
 
 
 def motion_table(results: "Results", axis: HorizontalAxis) -> TextTable:
-    """Return the table of the frames nearest to round flexion angles, or at even times."""
+    """Return the table of results at the frames of `HorizontalAxis.stops`."""
     entries = [entry for entry in _entries(results, axis) if np.isfinite(entry[2]).any()]
     stops = axis.stops(13 if axis.kind == "flexion" else 11)
     return TextTable(
@@ -171,7 +171,7 @@ def motion_table(results: "Results", axis: HorizontalAxis) -> TextTable:
 
 
 def strain_table(summary: Mapping[str, Any]) -> TextTable | None:
-    """Return the table of the ligaments' strains, %; a high strain reveals a wrong insertion."""
+    """Return the table of the ligaments' strains, %. A high strain suggests a wrong insertion."""
     result = summary.get("ligament_strain")
     if not result:
         return None
@@ -280,10 +280,10 @@ WEAR_NAME, PICTURE_NAME, WORN_NAME = "wear.json", "wear.png", "wear.vtp"
 
 @dataclass(frozen=True)
 class WearPageSettings:
-    """The wear page."""
+    """Limits on files of wear results."""
 
     max_bytes: float = 64 * MEGABYTE
-    """Bytes of a file of results. Chosen: those of 10,000 updates have 10 MB."""
+    """Bytes: largest size of a file. Chosen because the file of 10,000 updates has 10 MB."""
 
 
 WEAR_PAGE = WearPageSettings()
@@ -300,7 +300,7 @@ WEAR_ROWS = (
     ("creep depth, mm", "creep_depth_mm"),
     ("creep volume, mm³", "creep_volume_mm3"),
 )
-"""Label of a number, and its key."""
+"""Label and key of each number."""
 FIRST_RATE = "first_volume_mm3_per_Mc"
 OTHER_WEAR = (
     "The wear.json of this folder is not shown: it belongs to another scene, other frames or other "
@@ -309,9 +309,9 @@ OTHER_WEAR = (
 
 
 def wear_section(results: "Results") -> dict[str, Any] | None:
-    """Return the content of the section on wear; None if the folder has no wear.json.
+    """Return the content of the section on wear; None: the folder has no wear.json.
 
-    Wear of another scene or of other frames is not shown; the section then says so.
+    If wear.json belongs to another scene or other frames, the section states only this.
 
     Raises:
         InputError: wear.json or its picture cannot be read.
@@ -332,7 +332,7 @@ def wear_section(results: "Results") -> dict[str, Any] | None:
 
 
 def _wear_content(wear: dict[str, Any], picture: str) -> dict[str, Any]:
-    """Return the section of wear.json and its picture in base 64."""
+    """Return the section from the content of wear.json and its picture in base 64."""
     bands = wear["bands"] or {}
     return {
         "other": None,
@@ -361,13 +361,13 @@ def _wear_content(wear: dict[str, Any], picture: str) -> dict[str, Any]:
 
 
 def wear_of_run(results: "Results") -> dict[str, Any] | None:
-    """Return the content of wear.json beside a run; None if the folder has no such file.
+    """Return the content of wear.json in a run's folder; None: the folder has no such file.
 
-    The content is empty if it belongs to another scene, other files or other frames. Wear of the
-    whole motion of a scene, or of a simulator cycle, belongs to every choice of frames.
+    The result is empty if wear.json belongs to another scene, other files or other frames. Wear of
+    the whole motion, or of a simulator cycle, belongs to a run of any frames.
 
     Raises:
-        InputError: it cannot be read.
+        InputError: wear.json cannot be read.
     """
     folder = results.directory
     if folder is None or not (folder / WEAR_NAME).is_file():
@@ -403,7 +403,7 @@ def _wear_legend(wear: dict[str, Any], bands: dict[str, Any]) -> str:
 
 
 def _wear_range(wear: dict[str, Any], key: str) -> str:
-    """Return the range of a number that follows from the range of the wear factor."""
+    """Return in words the range of a number over the range of the wear factor."""
     limits = wear.get(f"{key}_range")
     return "–" if limits is None else f"{_significant(limits[0])} to {_significant(limits[1])}"
 

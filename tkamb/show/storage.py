@@ -1,4 +1,4 @@
-"""Writes OpenSim's files: `.sto` and `.mot` tables, `.trc` markers."""
+"""Writing of OpenSim files: `.sto` and `.mot` tables, `.trc` markers."""
 
 import os
 from collections.abc import Mapping
@@ -24,11 +24,12 @@ def write_storage(path: Path, columns: Mapping[str, Array], in_degrees: bool) ->
 
     Args:
         path: path of the file.
-        columns: name -> (n,) values, "time" (s) first.
+        columns: name -> (n,) values. The first is "time", s.
         in_degrees: whether the header states degrees.
 
     Raises:
-        InputError: no time, unequal lengths, a blank in a name, or no place to write.
+        InputError: "time" is not first, lengths differ, a name has a blank, or the file cannot be
+            written.
     """
     names = list(columns)
     lengths = {len(values) for values in columns.values()}
@@ -62,14 +63,14 @@ def write_results_storage(results: "Results", path: Path) -> str:
         path: path of a new file, .sto or .mot.
 
     Returns:
-        A line that tells how many frames and columns were written.
+        A line of text with the numbers of frames and columns.
 
     Raises:
-        InputError: another format, a file that exists already, times that do not rise, or no
-            place to write.
+        InputError: the suffix is another one, the file exists, times do not increase, or the file
+            cannot be written.
     """
     if path.suffix.lower() not in STORAGE:
-        raise InputError(f"is none of {', '.join(STORAGE)}", path, "name a file that ends so")
+        raise InputError(f"does not end in {' or '.join(STORAGE)}", path, "rename the file")
     if os.path.lexists(path):
         raise InputError(
             "exists already", path, "give a new file: tkamb does not replace your files"
@@ -77,7 +78,7 @@ def write_results_storage(results: "Results", path: Path) -> str:
     numbers = {name: v for name, v in results.columns.items() if KINDS.get(name) != "text"}
     time = numbers.pop("time_s")
     if not (np.diff(time) > 0).all():
-        raise InputError("holds times that do not rise, as OpenSim wants them", results.directory)
+        raise InputError("has times that do not increase; OpenSim needs this", results.directory)
     failures, doubtful = failed(results), flagged(results)
     status = np.where(failures, 2.0, np.where(doubtful, 1.0, 0.0))
     write_storage(path, {"time": time, **numbers, "status": status}, in_degrees=True)
@@ -88,16 +89,16 @@ def write_results_storage(results: "Results", path: Path) -> str:
 
 
 def write_trc(path: Path, time: Array, markers: Mapping[str, Array], rate_Hz: float) -> None:
-    """Write markers as a `.trc` file in millimetres; a gap has empty cells.
+    """Write markers as a `.trc` file in millimetres. A missing position has empty cells.
 
     Args:
         path: path of the file.
         time: (n,) s, times of the rows.
-        markers: label -> (n, 3) m, positions; NaN in gaps.
+        markers: label -> (n, 3) positions, m; NaN where missing.
         rate_Hz: sampling rate of the recording, Hz.
 
     Raises:
-        InputError: no place to write.
+        InputError: the file cannot be written.
     """
     count, names = len(time), list(markers)
     header = ["DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units"]

@@ -1,4 +1,4 @@
-"""Figures of studies: designs of a cohort side by side, and the cases of `tkamb stability`."""
+"""Figures of studies: the designs of a cohort, and the cases of `tkamb stability`."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ from tkamb.studies.cohort.statistics import Group
 from tkamb.studies.verdict import KINDS, VERDICT, Verdict
 
 WEAR = "volume_mm3_per_Mc"
-"""Name of the worn volume in a group's wear; its ends by the wear factor add _low and _high."""
+"""Key of the worn volume in `Group.wear`. With _low or _high: an end of the wear factor's range."""
 BANDS = (
     "Dot: mean over the runs. Thick bar: smallest to largest run. Thin bar: these ends extended by "
     "the known error of the contact model (pressure), or by the range of the wear factor (wear), "
@@ -35,11 +35,11 @@ BANDS = (
 
 @dataclass(frozen=True)
 class DesignFigureSettings:
-    """Looks of the figure."""
+    """Style of the figure of designs."""
 
     spread: float = 0.5
-    """1: share of the width of a place on the horizontal axis over which its dots stand side by
-    side. Chosen by eye."""
+    """1: width of the dots of one tick on the horizontal axis, as a share of the distance between
+    ticks. Chosen by eye."""
 
 
 DESIGN_FIGURE = DesignFigureSettings()
@@ -50,11 +50,11 @@ class Bar:
     """One design in one plot.
 
     Args:
-        place: its label on the horizontal axis.
-        series: its label in the legend; "" without one.
-        mean: over the runs.
-        low: smallest run.
-        high: largest run.
+        place: label on the horizontal axis.
+        series: label in the legend; "": no label.
+        mean: mean over the runs.
+        low: smallest value of the runs.
+        high: largest value of the runs.
         least: lower end of the uncertainty.
         most: upper end of the uncertainty.
     """
@@ -69,7 +69,7 @@ class Bar:
 
 
 def run_error(run: CohortRun) -> KnownError | None:
-    """Return the known error of a run's contact model; None without contact or a measured one."""
+    """Return the known error of a run's contact model; None: it is unknown, or no contact."""
     table = run.scene.contact
     if table is None:
         return None
@@ -78,13 +78,13 @@ def run_error(run: CohortRun) -> KnownError | None:
 
 
 def factor_names(cohort: Cohort) -> list[str]:
-    """Return the names of the designs' factors, those that make the axis first."""
+    """Return the names of the designs' factors. The first is the one on the horizontal axis."""
     return list(dict.fromkeys(name for design in cohort.table.design for name in design.factors))
 
 
 def design_bars(cohort: Cohort, groups: Sequence[Group]) -> dict[str, list[Bar]]:
-    """Return "pressure" and "wear" -> the bars of all groups that have it."""
-    found: dict[str, list[Bar]] = {"pressure": [], "wear": []}
+    """Return "pressure" and "wear" -> the bars of the groups with such results."""
+    result: dict[str, list[Bar]] = {"pressure": [], "wear": []}
     for group in groups:
         sides = [group.peaks.get(f"{side}_peak_pressure_MPa") for side in SIDES]
         present = [values for values in sides if values is not None]
@@ -93,15 +93,15 @@ def design_bars(cohort: Cohort, groups: Sequence[Group]) -> dict[str, list[Bar]]
             errors = [run_error(cohort.runs[n]) for n in group.numbers]
             share = np.array([one.peak_pressure if one else np.nan for one in errors])
             bars = _bar(cohort, group, peaks, peaks * (1 - share), peaks * (1 + share))
-            found["pressure"] += bars
+            result["pressure"] += bars
         if WEAR in group.wear:
             ends = (group.wear.get(f"{WEAR}_{end}", group.wear[WEAR]) for end in ("low", "high"))
-            found["wear"] += _bar(cohort, group, group.wear[WEAR], *ends)
-    return found
+            result["wear"] += _bar(cohort, group, group.wear[WEAR], *ends)
+    return result
 
 
 def _bar(cohort: Cohort, group: Group, values: Array, least: Array, most: Array) -> list[Bar]:
-    """Return a group's bar; none where no run has the number."""
+    """Return a list with the bar of a group; it is empty if all values are NaN."""
     if not np.isfinite(values).any():
         return []
     place, series = _labels(cohort, group)
@@ -112,31 +112,35 @@ def _bar(cohort: Cohort, group: Group, values: Array, least: Array, most: Array)
 
 
 def _labels(cohort: Cohort, group: Group) -> tuple[str, str]:
-    """Return a group's place on the axis and its series: by factors, else its name alone."""
+    """Return place and series of a group's bar.
+
+    The place is the first factor of the design, the series its other factors. Without factors
+    the place is the name of the group.
+    """
     names = factor_names(cohort)
     designs = {one.name: one for one in cohort.table.design}
     design = designs.get(group.labels.get("design", ""))
     if not names or design is None:
         return group.name, ""
     others = group.name_without("design")
-    rest = [f"{name} {design.factors.get(name, '–')}" for name in names[1:]]
-    rest += [] if others == "all runs" else [others]
-    return f"{names[0]} {design.factors.get(names[0], '–')}", ", ".join(rest)
+    series = [f"{name} {design.factors.get(name, '–')}" for name in names[1:]]
+    series += [] if others == "all runs" else [others]
+    return f"{names[0]} {design.factors.get(names[0], '–')}", ", ".join(series)
 
 
 def draw_designs(bars: Mapping[str, Sequence[Bar]]) -> Figure:
-    """Return peak pressure and worn volume of the designs side by side, with their bands."""
-    filled = {name: own for name, own in bars.items() if own}
+    """Return plots of the designs' peak pressures and worn volumes, with their uncertainties."""
+    filled = {name: some for name, some in bars.items() if some}
     titles = {
         "pressure": "Peak contact pressure (MPa)",
         "wear": "Worn volume (mm³ per million cycles)",
     }
     with settings():
         figure = new_figure(5.4 * len(filled), 3.6)
-        for axes, (name, own) in zip(
+        for axes, (name, some) in zip(
             figure.subplots(1, len(filled), squeeze=False)[0], filled.items(), strict=True
         ):
-            _draw_bars(axes, own)
+            _draw_bars(axes, some)
             axes.set_ylabel(titles[name])
     return figure
 
@@ -146,15 +150,15 @@ def _draw_bars(axes: Axes, bars: Sequence[Bar]) -> None:
     series = list(dict.fromkeys(bar.series for bar in bars))
     step = DESIGN_FIGURE.spread / max(len(series), 1)
     for k, name in enumerate(series):
-        own = [bar for bar in bars if bar.series == name]
+        some = [bar for bar in bars if bar.series == name]
         shift = (k - 0.5 * (len(series) - 1)) * step
-        x = [places.index(bar.place) + shift for bar in own]
+        x = [places.index(bar.place) + shift for bar in some]
         colour = CYCLE[k % len(CYCLE)]
-        axes.vlines(x, [b.least for b in own], [b.most for b in own], color=colour, linewidth=1)
+        axes.vlines(x, [b.least for b in some], [b.most for b in some], color=colour, linewidth=1)
         axes.vlines(
-            x, [b.low for b in own], [b.high for b in own], color=colour, linewidth=5, alpha=0.4
+            x, [b.low for b in some], [b.high for b in some], color=colour, linewidth=5, alpha=0.4
         )
-        axes.plot(x, [b.mean for b in own], "o", color=colour, markersize=5, label=name or None)
+        axes.plot(x, [b.mean for b in some], "o", color=colour, markersize=5, label=name or None)
     slanted = max(map(len, places)) * len(places) > 60
     axes.set_xticks(range(len(places)), places, rotation=30 if slanted else 0)
     axes.set_xlim(-0.6, len(places) - 0.4)
@@ -167,7 +171,7 @@ VERDICT_COLOURS = {"converged": BLUE, "flagged": ORANGE}
 
 
 def picture(verdicts: Sequence[Verdict]) -> Figure:
-    """Return one dot per case: its extreme parameter against the distance from the reference."""
+    """Return a plot with a dot per case: extreme parameter against distance from the reference."""
     groups = list(dict.fromkeys(_group(v) for v in verdicts))
     with settings():
         figure = new_figure(8.0, 1.6 + 0.2 * len(groups))
@@ -202,7 +206,7 @@ def _distance(verdict: Verdict) -> float:
 
 
 def _group(verdict: Verdict) -> str:
-    """Return the extreme parameters, or the run's kind."""
+    """Return the label of a case: its extreme parameters, its model, or the kind of its run."""
     if verdict.contact == "run":
         return " ".join(verdict.case.split()[:2])
     if verdict.contact != "lattice":

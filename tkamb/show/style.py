@@ -1,4 +1,4 @@
-"""One look for every picture: colours that colour-blind readers can tell apart, and SVG text.
+"""Style of all pictures: colours that colour-blind readers can distinguish, and SVG text.
 
 Colours: Okabe & Ito (2008), Color Universal Design. Pressure: viridis, perceptually uniform.
 """
@@ -17,13 +17,13 @@ GREEN, PURPLE = "#009E73", "#CC79A7"
 MEDIAL, LATERAL = BLUE, VERMILLION
 SIDE_COLOURS = {"medial": MEDIAL, "lateral": LATERAL}
 SUPERIOR, ANTERIOR, RIGHT = "#5D3A9B", "#2A9D8F", "#7B8B00"
-"""Of forces along the insert axes, and of moments and rotations about them."""
+"""Colours of forces along the insert axes, and of moments and rotations about these axes."""
 QUADRICEPS, PATELLAR_LIGAMENT, PATELLOFEMORAL, HIP = "#882255", "#CC79A7", "#664400", "#6666EE"
 GROUND = "#388C54"
 LIST = ("#332288", "#A6761D", "#009E73", "#AA4499")
-"""Of ligaments and muscles, which are too many: they are told apart within one plot."""
+"""Colours of ligaments and muscles, assigned anew in each plot because there are too many."""
 LIGAMENT = LIST[3]
-"""Of all ligaments together."""
+"""Colour of all ligaments together."""
 FORCE_COLOURS = {
     "ground reaction": GROUND,
     "hip": HIP,
@@ -34,7 +34,7 @@ FORCE_COLOURS = {
     "lateral condyle": LATERAL,
     "knee": BLACK,
 }
-"""Of every force that is drawn as an arrow; the plots draw the same force in the same colour."""
+"""Force that is drawn as an arrow -> its colour, also in plots."""
 CYCLE = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK, GREY)
 PRESSURE_MAP = "viridis"
 
@@ -69,14 +69,14 @@ SETTINGS: Any = {
 
 
 def new_figure(width: float, height: float) -> "Figure":
-    """Return an empty figure (inches) that needs no display."""
+    """Return an empty figure, size in inches. It needs no display."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
 
 
 def settings() -> Any:
-    """Return the context in which figures are made and written."""
+    """Return the matplotlib context in which figures are drawn and written."""
     import matplotlib as mpl
 
     return mpl.rc_context(SETTINGS)
@@ -85,11 +85,12 @@ def settings() -> Any:
 def svg_text(figure: "Figure", name: str, dpi: int = 150) -> str:
     """Return the figure as inline SVG that scales with the page.
 
-    It has no style element: the page's own says how lines join.
-    Every id is prefixed with `name`, so that many figures live in one page. `data-box` holds
-    the left, right, top and bottom of the first axes in the picture's units and `data-range`
-    the values at its left and right end, `data-heights` at its foot and head, for whoever draws
-    over it.
+    The SVG has no style element, because the page has the style of lines. All ids have the prefix
+    `name`, so that they are unique in the page. The page's scripts draw over the first axes with
+    these attributes of the SVG:
+      `data-box`: left, right, top and bottom of the axes, points.
+      `data-range`: values at the left and right end of the axes.
+      `data-heights`: values at the lower and upper end of the axes.
     """
     from tkamb.show.svg import written
 
@@ -125,7 +126,7 @@ def _box(figure: "Figure") -> str:
 
 
 def legend_above(axes: "Axes", columns: int = 4) -> None:
-    """Put the legend over the plot, left-aligned, where it covers no line."""
+    """Put the legend above the plot, left-aligned."""
     axes.legend(
         loc="lower left",
         bbox_to_anchor=(0, 1),

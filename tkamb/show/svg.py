@@ -28,18 +28,18 @@ class LabelPlaceSettings:
     """Room around the labels of a figure."""
 
     edge_points: float = 3.0
-    """Points around all labels of a figure. Chosen by eye."""
+    """Points: margin around all labels of a figure. Chosen by eye."""
     tick_points: float = 6.5
-    """Points that ticks with their gap take. Chosen by eye."""
+    """Points: length of a tick and the gap to its label. Chosen by eye."""
     tick_label_points: float = 9.0
-    """Points: size of letters. Chosen by eye."""
+    """Points: size of letters at ticks. Chosen by eye."""
 
 
 LABEL_PLACE = LabelPlaceSettings()
 
 
 def set_place(axes: Axes, x: float, bottom: float, wide: float, tall: float) -> None:
-    """Put axes at a place in their figure (points); its layout engine is not used."""
+    """Set the position of axes in their figure, points; switch off the figure's layout engine."""
     figure = axes.get_figure(root=True)
     assert figure is not None
     figure.set_layout_engine("none")
@@ -48,14 +48,14 @@ def set_place(axes: Axes, x: float, bottom: float, wide: float, tall: float) -> 
 
 
 def leave_unmeasured(axis: Axis) -> None:
-    """Have an axis draw its labels without measuring them first."""
+    """Make the layout engine ignore the tick labels of an axis, which saves their measurement."""
     for tick in axis.get_major_ticks(len(axis.get_majorticklocs())):
         tick.label1.set_in_layout(False)
         tick.label2.set_in_layout(False)
 
 
 def shown_labels(axis: Axis) -> list[tuple[float, float]]:
-    """Return an axis' labels: where each stands, 0 to 1 along the axis, and its width (points)."""
+    """Return position (0 to 1 along the axis) and width (points) of each visible tick label."""
     low, high = axis.get_view_interval()
     ticks = axis.get_majorticklocs()
     labels = axis.get_major_formatter().format_ticks(list(ticks))
@@ -68,12 +68,17 @@ def shown_labels(axis: Axis) -> list[tuple[float, float]]:
 
 
 def label_width(axis: Axis) -> float:
-    """Return the width (points) of a vertical axis' labels."""
+    """Return the width of the widest tick label of an axis, points."""
     return max((width for _, width in shown_labels(axis)), default=0.0)
 
 
 def overhang(axis: Axis, length: float) -> tuple[float, float]:
-    """Return how far labels of a horizontal axis reach beyond its left and right end, points."""
+    """Return how far tick labels of a horizontal axis extend past its left and right end, points.
+
+    Args:
+        axis: horizontal axis.
+        length: length of the axis, points.
+    """
     labels = shown_labels(axis)
     margin = max((0.5 * width - place * length for place, width in labels), default=0.0)
     right = max((0.5 * width - (1.0 - place) * length for place, width in labels), default=0.0)
@@ -81,10 +86,10 @@ def overhang(axis: Axis, length: float) -> tuple[float, float]:
 
 
 class Renderer(RendererSVG):
-    """Draws like matplotlib's own renderer, but measures each text once for all figures.
+    """SVG renderer that measures each text once for all figures.
 
-    Pictures given point by point (`interpolation="none"`) are smoothed by whoever shows them and
-    stand once in a figure, however often they are drawn; they are not clipped.
+    A picture with `interpolation="none"` is stored once in a figure, in its own resolution. The
+    browser smooths it. It is not clipped.
     """
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
@@ -99,7 +104,7 @@ class Renderer(RendererSVG):
         im: Any,
         transform: Affine2DBase | None = None,
     ) -> None:
-        """Draw a picture (rows, columns, 4); with a transform (points) it is given by points."""
+        """Draw a picture (rows, columns, 4). With a transform, its resolution is preserved."""
         if transform is None:
             return super().draw_image(gc, x, y, im)
         content, (rows, columns) = im.tobytes(), im.shape[:2]
@@ -116,7 +121,7 @@ class Renderer(RendererSVG):
         self.writer.element("use", href=f"#{name}", transform=f"matrix({matrix})")
 
     def _get_font_height_metrics(self, prop: FontProperties) -> tuple[float, float, float]:
-        """Return ascent, descent and line gap, points, which matplotlib needs since 3.11."""
+        """Return ascent, descent and line gap, points. Matplotlib 3.11 and later call this."""
         return _letter_heights(prop.copy())
 
     def get_text_width_height_descent(
@@ -127,18 +132,18 @@ class Renderer(RendererSVG):
 
 
 def written(figure: Figure, dpi: int) -> str:
-    """Return a figure as a whole SVG document in points.
+    """Return a figure as an SVG document in points.
 
     Args:
-        figure: not laid out yet; its layout engine does so.
-        dpi: resolution of pictures that are not given point by point.
+        figure: figure before its layout.
+        dpi: resolution of rasterized parts.
     """
     buffer = io.StringIO()
-    FigureCanvasSVG(figure)  # a layout measures with it
+    FigureCanvasSVG(figure)  # the layout engine measures with this canvas
     figure.set_dpi(72)
     width, height = figure.get_size_inches()
-    nothing = {"Date": None, "Creator": None}
-    vectors = Renderer(72 * width, 72 * height, buffer, image_dpi=dpi, metadata=nothing)
+    no_metadata = {"Date": None, "Creator": None}
+    vectors = Renderer(72 * width, 72 * height, buffer, image_dpi=dpi, metadata=no_metadata)
     renderer: Any = MixedModeRenderer(figure, width, height, dpi, vectors)
     figure.draw(renderer)
     renderer.finalize()
@@ -146,7 +151,7 @@ def written(figure: Figure, dpi: int) -> str:
 
 
 def png_address(picture: NDArray[np.uint8]) -> str:
-    """Return a picture, (rows, columns) of greys or (rows, columns, 4), as a PNG data address."""
+    """Return a grey picture (rows, columns) or RGBA (rows, columns, 4) as a PNG data address."""
     image, buffer = Image.fromarray(picture), io.BytesIO()
     if picture.ndim == 3 and (picture[..., :1] == picture[..., 1:3]).all():
         image = image.convert("LA")
@@ -155,7 +160,12 @@ def png_address(picture: NDArray[np.uint8]) -> str:
 
 
 def text_width(text: str, size: float) -> float:
-    """Return the width of a line of text in letters of a size, points; within `settings`."""
+    """Return the width of a line of text, points. Call it within `style.settings`.
+
+    Args:
+        text: line of text.
+        size: size of the letters, points.
+    """
     return _text_size(text, FontProperties(size=size), False)[0]
 
 
@@ -168,7 +178,7 @@ def _text_size(text: str, letters: FontProperties, ismath: Any) -> tuple[float, 
 def _letter_heights(letters: FontProperties) -> tuple[float, float, float]:
     font = get_font(findfont(letters))
     table, head = font.get_sfnt_table("OS/2"), font.get_sfnt_table("head")
-    assert table is not None and head is not None  # DejaVu, which comes with matplotlib, has both
+    assert table is not None and head is not None  # matplotlib's DejaVu font has these tables
     points = letters.get_size_in_points() / head["unitsPerEm"]
     ascent, descent = points * table["sTypoAscender"], -points * table["sTypoDescender"]
     return ascent, descent, points * table["sTypoLineGap"]

@@ -1,4 +1,4 @@
-"""Report of the trade-off: table, picture, fastest model for an error, comparisons."""
+"""Report of the trade-off study: table, picture, fastest model for an error, comparisons."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,16 +19,16 @@ MARKERS = "osD^vPX*<>"
 
 @dataclass(frozen=True)
 class TradeoffPictureSettings:
-    """Looks of the trade-off's picture."""
+    """Report of the trade-off study."""
 
     unlabelled_mm: float = 2.0
-    """mm: cell size that is not written beside its point. Chosen: most points have it."""
+    """mm: cell size that is not written beside its point. Chosen because most points have it."""
     short_axis_ratio: float = 30.0
-    """Largest over smallest value up to which a logarithmic axis has numbers within its decades.
-    Chosen: with more decades, those alone have numbers."""
+    """1: a logarithmic axis has labels within its decades up to this ratio of its ends. Chosen
+    because on longer axes the labels of the decades are enough."""
     min_bodies: int = 3
-    """Smallest number of different pairs of bodies that gives a recommendation. Chosen: the two of
-    the quick study suit `hertz`, whose errors on a knee are larger."""
+    """Smallest number of different pairs of bodies that gives a recommendation. Chosen because
+    the two pairs of the quick study suit `hertz`, whose errors on a knee are larger."""
 
 
 TRADEOFF_PICTURE = TradeoffPictureSettings()
@@ -41,13 +41,13 @@ LIMITS = {
     "area": (0.05, 0.10),
     "map": (0.10,),
 }
-"""Errors for which the fastest model is named."""
+"""Error limits, 1, for which the fastest model is recommended."""
 NAMES = dict(zip(KEYS, (key.replace("_", " ") for key in KEYS), strict=True)) | {
     "force": "condyle force",
     "map": "the pressure map (L2)",
 }
 COMPARED_ON, COMPARED_AT_MM = "two condyles", 2.0
-"""Case and cell size on which the default lattice is compared with finite elements."""
+"""Case and cell size, mm, for the comparison of the default lattice with finite elements."""
 DEFAULT = "lattice"
 
 Setting = tuple[str, float]
@@ -96,7 +96,7 @@ def _uncertainty(reference: Reference) -> str:
 
 
 def picture(rows: Sequence[Row]) -> Figure:
-    """Return error against time, one panel per case, the front as a line."""
+    """Return plots of error against time, one per case, with the Pareto front as a line."""
     cases = list(dict.fromkeys(row.job.case for row in rows))
     labels = list(dict.fromkeys(row.job.label for row in rows))
     columns = min(4, len(cases))
@@ -162,7 +162,7 @@ def _panel(axis: Axes, rows: Sequence[Row], labels: Sequence[str]) -> None:
 
 
 def _plain_ticks(axis: Axes) -> None:
-    """Write 1, 2, 5, 10 and so on where a logarithmic axis is short; of all panels that share."""
+    """Label short logarithmic axes at 1, 2, 5, 10 and so on, also in panels that share them."""
     for side, (low, high) in ((axis.xaxis, axis.get_xlim()), (axis.yaxis, axis.get_ylim())):
         if high < TRADEOFF_PICTURE.short_axis_ratio * low:
             side.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -180,17 +180,17 @@ def setting_of(row: Row) -> Setting:
 
 
 def bodies_of(case: str) -> str:
-    """Return the name of a case's bodies: poses of one knee share them, varus is a pose too."""
+    """Return the name of the bodies of a case. All poses of the same bodies share it."""
     if case.endswith(" deg"):
         return case.split()[0]
     return {"varus": "two condyles"}.get(case, case)
 
 
 def recommendations(rows: Sequence[Row]) -> list[str]:
-    """Return a sentence for each limit: the fastest model that keeps it wherever it was tried.
+    """Return a sentence for each limit: the fastest setting that is within it in all cases.
 
-    Only settings that were tried on all bodies are compared, by their median warm time over
-    one case of each. Two pairs of bodies give no recommendation: they may suit a simple model.
+    Only settings with results on all pairs of bodies are compared. Their time is the median over
+    the pairs of the time of a warm press.
     """
     if len({bodies_of(row.job.case) for row in rows}) < TRADEOFF_PICTURE.min_bodies:
         return ["no recommendation from so few cases: run the whole study, without --quick"]
@@ -231,7 +231,7 @@ def _fastest(settings: dict[Setting, list[Row]], key: str, limit: float) -> str:
 
 
 def warm_by_bodies(rows: Sequence[Row]) -> list[float]:
-    """Return one warm time (s) for each pair of bodies, the median of its poses."""
+    """Return for each pair of bodies the median time of a warm press over its poses, s."""
     bodies = dict.fromkeys(bodies_of(row.job.case) for row in rows)
     return [
         median(row.measure.warm_seconds for row in rows if bodies_of(row.job.case) == body)
@@ -250,14 +250,14 @@ def _named(setting: Setting) -> str:
 
 
 def comparison(rows: Sequence[Row]) -> list[str]:
-    """Return how the default lattice compares with finite elements, measured in this run."""
+    """Return sentences that compare the default lattice with finite elements in this study."""
     some = [row for row in rows if row.job.case == COMPARED_ON and row.errors]
-    own = {row.job.resolution_mm: row for row in some if row.job.label == DEFAULT}
-    if COMPARED_AT_MM not in own:
+    lattice = {row.job.resolution_mm: row for row in some if row.job.label == DEFAULT}
+    if COMPARED_AT_MM not in lattice:
         return []
-    where = "is" if own[COMPARED_AT_MM].on_front else "is not"
-    time = milliseconds(own[COMPARED_AT_MM].measure.warm_seconds)
-    front = ", ".join(f"{size:g}" for size, row in own.items() if row.on_front)
+    where = "is" if lattice[COMPARED_AT_MM].on_front else "is not"
+    time = milliseconds(lattice[COMPARED_AT_MM].measure.warm_seconds)
+    front = ", ".join(f"{size:g}" for size, row in lattice.items() if row.on_front)
     first = (
         f"{COMPARED_ON}, 2000 N, nonlinear, {COMPARED_AT_MM:g} mm: {DEFAULT} takes {time} ms a "
         f"position (warm) and {where} on the front; its cell sizes on the front: {front or 'none'}"
@@ -271,12 +271,12 @@ def comparison(rows: Sequence[Row]) -> list[str]:
     ]
     return [
         first,
-        *(_against(r, own[size]) for r in others if (size := r.job.resolution_mm) in own),
+        *(_against(r, lattice[size]) for r in others if (size := r.job.resolution_mm) in lattice),
     ]
 
 
-def _against(row: Row, own: Row) -> str:
-    label, times = row.job.label, row.measure.warm_seconds / own.measure.warm_seconds
+def _against(row: Row, lattice: Row) -> str:
+    label, times = row.job.label, row.measure.warm_seconds / lattice.measure.warm_seconds
     line = (
         f"{label} at {row.job.resolution_mm:g} mm: {milliseconds(row.measure.warm_seconds)} ms, "
         f"{times:.3g} times as long as {DEFAULT}"
@@ -284,13 +284,15 @@ def _against(row: Row, own: Row) -> str:
     if label == "fe":
         line += "; it shares the lattice's stored response and solver"
     if label.startswith("calculix"):
-        line += f"; {_apart(own, row)}; CalculiX has finite strain, the lattice small strain"
+        line += (
+            f"; {_difference(lattice, row)}; CalculiX has finite strain, the lattice small strain"
+        )
     return line
 
 
-def _apart(own: Row, peer: Row) -> str:
-    """Return how far the lattice is from the peer, in per cent of the peer."""
-    a, b = own.measure.values, peer.measure.values
+def _difference(lattice: Row, peer: Row) -> str:
+    """Return the differences of the lattice from another model in words, % of that model."""
+    a, b = lattice.measure.values, peer.measure.values
     if not a or not b:
         return "values not kept"
     load = sum(b[f"{side}_force"] for side in SIDES)

@@ -1,9 +1,9 @@
-"""A knee on a bench: one pose, an axial load, placement and ligaments changed by hand.
+"""The knee of `tkamb live`: one pose, an axial load, placement and ligaments changed by the user.
 
-`tkamb live` computes such a knee. A `BenchRequest` becomes a static case without muscles and
-patella. The axial load acts along the tibia's long axis, through the origin of the insert frame of
-the scene. This line stays on the bone when the user moves the insert. The code is that of a frame
-of a run. So `tkamb run` gives the same numbers for the scene that `bench_scene.write_bench` writes.
+A `BenchRequest` becomes a static case without muscles and patella. The axial load acts along the
+tibia's long axis, through the origin of the insert frame of the scene. This line of action is fixed
+to the bone, also if the user moves the insert. `tkamb run` gives the same numbers for the scene
+that `bench_scene.write_bench` writes.
 """
 
 from collections.abc import Mapping
@@ -41,31 +41,31 @@ class BenchLimitSettings:
     """Ranges of the sliders of `tkamb live`."""
 
     flexion_deg: tuple[float, float] = (-20.0, 160.0)
-    """deg; smallest and largest flexion. Chosen because a scene accepts them even if a component is
+    """deg: smallest and largest flexion. Chosen because a scene accepts them even if a component is
     rotated by `placement_deg`, so every state can be saved."""
     adduction_deg: float = 20.0
-    """deg; largest varus or valgus. Chosen for the same reason as `flexion_deg`."""
+    """deg: largest varus or valgus. Chosen for the same reason as `flexion_deg`."""
     axial_rotation_deg: float = 60.0
-    """deg; largest internal or external rotation. Chosen for the same reason as `flexion_deg`."""
+    """deg: largest internal or external rotation. Chosen for the same reason as `flexion_deg`."""
     length_mm: float = 60.0
-    """mm; largest translation of the femur. Chosen because the femur is then beside the insert."""
+    """mm: largest translation of the femur. Chosen because the femur is then beside the insert."""
     placement_deg: float = 20.0
-    """deg; largest change of a component's orientation. Chosen because surgical errors are below
+    """deg: largest change of a component's orientation. Chosen because surgical errors are below
     it."""
     placement_mm: float = 20.0
-    """mm; largest change of a component's position. Chosen because surgical errors are smaller."""
+    """mm: largest change of a component's position. Chosen because surgical errors are smaller."""
     load_N: float = 15_000.0
-    """N; largest axial load. Chosen because load and weight of the shank together are below the
+    """N: largest axial load. Chosen because load and weight of the shank together are below the
     largest force that a scene accepts from a force plate."""
     slack_percent: float = 20.0
-    """%; largest increase or decrease of the ligaments' slack lengths. Chosen because ligaments of
+    """%: largest increase or decrease of the ligaments' slack lengths. Chosen because ligaments of
     the knee rupture at strains of 12 to 20 %."""
     finest_mm: float = 0.5
-    """mm; smallest spacing of the map. Chosen because a finer map cannot follow a slider."""
+    """mm: smallest spacing of the map. Chosen because a finer map cannot follow a slider."""
     coarsest_mm: float = 10.0
-    """mm; largest spacing of the map. Chosen equal to the limit in `MapGridSettings`."""
+    """mm: largest spacing of the map. Chosen equal to the limit in `MapGridSettings`."""
     thickness_mm: tuple[float, float] = (4.0, 25.0)
-    """mm; smallest and largest thickness of a parametric insert. Chosen because inserts are sold
+    """mm: smallest and largest thickness of a parametric insert. Chosen because inserts are sold
     with 6 to 20 mm."""
     kept_models: int = 8
     """Number of prepared contact models that stay in memory. Chosen because a lattice takes 0.1 to
@@ -74,7 +74,7 @@ class BenchLimitSettings:
     """Number of contact models that are prepared at the same time. Chosen because the machine must
     still compute the coarse model while a slider moves."""
     first_penetration: float = 5e-5
-    """m; penetration at which a search for released coordinates begins. Chosen equal to
+    """m: penetration at which a search for released coordinates begins. Chosen equal to
     `initial_pose.first_penetration`."""
 
 
@@ -146,26 +146,26 @@ class BenchRequest:
         Raises:
             InputError: a key is unknown, or a value is not a number or outside its range.
         """
-        known = {one.name for one in fields(BenchRequest)}
+        names = {one.name for one in fields(BenchRequest)}
         for key in values:
-            if key not in known:
-                raise InputError(f"no '{key}' on the bench", None, names_near(key, known))
-        made: dict[str, Any] = {}
+            if key not in names:
+                raise InputError(f"no '{key}' on the bench", None, names_near(key, names))
+        arguments: dict[str, Any] = {}
         for key, value in values.items():
             if key in ("femoral", "tibial"):
-                made[key] = _placement(key, value)
+                arguments[key] = _placement(key, value)
             elif key == "released":
-                made[key] = _released(value)
+                arguments[key] = _released(value)
             elif key == "contact":
-                made[key] = str(value)
+                arguments[key] = str(value)
             elif key == "thickness_mm" and value is None:
-                made[key] = None
+                arguments[key] = None
             else:
-                made[key] = _number(key, value, *_range(key))
-        return BenchRequest(**made)
+                arguments[key] = _number(key, value, *_range(key))
+        return BenchRequest(**arguments)
 
     def coordinates(self) -> Array:
-        """Return the knee coordinates (6,), m and rad, of the unmoved components; si is 0."""
+        """Return the knee coordinates (6,), m and rad, before components are moved; si is 0."""
         values = {
             "ap": self.ap_mm * MILLIMETRE,
             "ml": self.ml_mm * MILLIMETRE,
@@ -199,9 +199,9 @@ def _number(key: str, value: Any, low: float, high: float) -> float:
 
 
 def _placement(name: str, values: Any) -> Placement:
-    known = {one.name for one in fields(Placement)}
-    if not isinstance(values, Mapping) or not set(values) <= known:
-        raise InputError(f"{name} is no placement", "bench", f"keys: {', '.join(sorted(known))}")
+    names = {one.name for one in fields(Placement)}
+    if not isinstance(values, Mapping) or not set(values) <= names:
+        raise InputError(f"{name} is no placement", "bench", f"keys: {', '.join(sorted(names))}")
     limits = BENCH_LIMIT
     return Placement(
         **{
@@ -220,16 +220,16 @@ def _placement(name: str, values: Any) -> Placement:
 
 
 def _released(values: Any) -> tuple[str, ...]:
-    known = [name for name in KNEE_COORDINATES if name != "flexion"]
-    if not isinstance(values, list | tuple) or any(name not in known for name in values):
-        raise InputError("released names no coordinates", "bench", f"of {', '.join(known)}")
+    names = [name for name in KNEE_COORDINATES if name != "flexion"]
+    if not isinstance(values, list | tuple) or any(name not in names for name in values):
+        raise InputError("released names no coordinates", "bench", f"of {', '.join(names)}")
     chosen = set(values) | ({"si"} if values else set())
-    return tuple(name for name in known if name in chosen)
+    return tuple(name for name in names if name in chosen)
 
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """A case on the bench: its parts that no request changes.
+    """The parts of a case that no request changes.
 
     Args:
         case: case of a scene with [contact].
@@ -243,11 +243,11 @@ class Bench:
     def bundles(self) -> "tuple[Ligament, ...]":
         """Return the ligaments with both ends on the links "femur" and "tibia"."""
         return tuple(
-            replace(one, proximal=self._carried(one.proximal), distal=self._carried(one.distal))
+            replace(one, proximal=self._on_bone(one.proximal), distal=self._on_bone(one.distal))
             for one in self.ligaments
         )
 
-    def _carried(self, end: LinkPoint) -> LinkPoint:
+    def _on_bone(self, end: LinkPoint) -> LinkPoint:
         chain = self.case.chain
         link = chain.carrier(end.link)
         return LinkPoint(link, transform(chain.link_in(end.link, link), end.position))
@@ -354,7 +354,5 @@ class Bench:
 
 
 def _upright() -> BodyMotion:
-    nothing = np.zeros((ROWS, 6))
-    return BodyMotion(
-        np.arange(ROWS, dtype=float), np.tile(np.eye(4), (ROWS, 1, 1)), nothing, nothing
-    )
+    zeros = np.zeros((ROWS, 6))
+    return BodyMotion(np.arange(ROWS, dtype=float), np.tile(np.eye(4), (ROWS, 1, 1)), zeros, zeros)

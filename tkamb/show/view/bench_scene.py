@@ -35,18 +35,18 @@ if TYPE_CHECKING:
 logger = logging.getLogger("tkamb")
 
 ROWS = 6
-"""Number of equal rows of the tables; accelerations need at least so many."""
+"""Number of equal rows in the tables. Accelerations need at least this number."""
 
 
-def write_bench(case: Case, folder: Path, own: Path | None = None) -> Path:
+def write_bench(case: Case, folder: Path, session: Path | None = None) -> Path:
     """Write a case of `Bench.case_of` as a scene for `tkamb run`, and return the scene file.
 
-    The URDF is copied. Meshes are not copied: the scene holds their paths.
+    The URDF is copied. The scene holds the paths of meshes outside `session`.
 
     Args:
-        case: a static case.
-        folder: an existing folder; files with the same names are replaced.
-        own: folder of this session; meshes in it are copied. None: no mesh is copied.
+        case: static case.
+        folder: existing folder. Files with the same names are replaced.
+        session: folder with meshes of this session, which are copied; None: no mesh is copied.
     """
     scene, side = case.scene, -1.0 if case.scene.patient.side == "left" else 1.0
     times = case.motion.time
@@ -64,7 +64,7 @@ def write_bench(case: Case, folder: Path, own: Path | None = None) -> Path:
     meshes = {}
     for name in ("femoral", "insert"):
         meshes[name] = getattr(scene.implant, name).model_dump(exclude_none=True)
-        if own is not None and meshes[name]["mesh"].is_relative_to(own):
+        if session is not None and meshes[name]["mesh"].is_relative_to(session):
             copied = shutil.copy(meshes[name]["mesh"], folder)
             meshes[name]["mesh"] = Path(copied).name
     text = _scene_text(case, side, meshes)
@@ -141,7 +141,7 @@ STILL = {
         | {"moment_2": "my_Nm"},
     ),
 }
-"""Tables of a static scene; `write_bench` writes the files that they name."""
+"""Tables of a static scene. `write_bench` writes their files."""
 
 
 def _scene_text(case: Case, side: float, meshes: Mapping[str, Mapping[str, Any]]) -> str:
@@ -206,9 +206,9 @@ def ligament_table(bundle: "Ligament", side: float) -> dict[str, Any]:
 def still_motion(coordinates: Array) -> KneeMotion:
     """Return a motion without velocity from knee coordinates (f, 6), m and rad, of a right knee."""
     frames = len(coordinates)
-    nothing, still = np.zeros((frames, 6)), np.zeros(frames)
+    rates, deviation = np.zeros((frames, 6)), np.zeros(frames)
     time = np.arange(frames, dtype=float)
-    return KneeMotion(time, coordinates, nothing, nothing, coordinates, still, still)
+    return KneeMotion(time, coordinates, rates, rates, coordinates, deviation, deviation)
 
 
 def write_knee(knee: Knee, placement: Array, coordinates: Array, folder: Path) -> Path:
@@ -219,10 +219,10 @@ def write_knee(knee: Knee, placement: Array, coordinates: Array, folder: Path) -
     insert, as in `Knee.press`. The scene has no muscles, extensor mechanism or friction.
 
     Args:
-        knee: the knee.
+        knee: knee with both components and a contact model.
         placement: (4, 4) pose of the insert's mesh in the insert frame (`insert_placement`).
-        coordinates: knee coordinates (f, 6) of a right knee; only the first row is written.
-        folder: an empty folder.
+        coordinates: knee coordinates (f, 6) of a right knee. Only the first row is written.
+        folder: empty folder.
     """
     sign = -1.0 if knee.left else 1.0
     assert knee.femoral is not None and knee.insert is not None
@@ -253,10 +253,10 @@ def write_knee(knee: Knee, placement: Array, coordinates: Array, folder: Path) -
 
 
 def _bundles(knee: Knee, tibia: Array) -> "list[Ligament]":
-    """Return the bundles between femur and tibia, under names that a scene accepts.
+    """Return the bundles between femur and tibia, with names that a scene accepts.
 
     Args:
-        knee: the knee.
+        knee: knee with ligaments.
         tibia: (4, 4) pose of the knee's tibia link in the tibia link of the scene.
     """
     bundles: list[Ligament] = []
@@ -301,11 +301,11 @@ def _contact_lines(knee: Knee) -> list[str]:
             )
     contact: dict[str, Any] = {"model": name, "resolution_mm": model.resolution / MILLIMETRE}
     contact |= {"options": options} if options else {}
-    given = knee.implant.insert_material
-    built_in = next((one for one in MATERIALS if material(one) == given), None)
+    insert_material = knee.implant.insert_material
+    built_in = next((one for one in MATERIALS if material(one) == insert_material), None)
     if built_in is not None:
         return table_lines("[contact]", contact | {"material": built_in})
-    values = material_as_json(given)
+    values = material_as_json(insert_material)
     if values["law"] not in LAW_KEYS:
         raise InputError(f"material law {values['law']}", "Knee.live", "a scene cannot hold it")
     if values["name"] in MATERIALS:

@@ -97,19 +97,19 @@ def _pressure_map(results: "Results", rows: list[int]) -> PressureMap | None:
     maps = results.maps
     if maps is None or all(row < 0 for row in rows):
         return None
-    nothing = np.full(len(maps.points_m), np.nan)
+    missing = np.full(len(maps.points_m), np.nan)
     pressure, gap = (
-        np.stack([stored[row] if row >= 0 else nothing for row in rows])
+        np.stack([stored[row] if row >= 0 else missing for row in rows])
         for stored in (maps.pressure_Pa / MEGAPASCAL, maps.gap_m)
     )
     return PressureMap(maps.points_m, maps.triangles, pressure, gap)
 
 
 def lattice_lines(case: Case) -> Array:
-    """Return the edges (s, 2, 3) m of the lattice's outer cell faces, insert frame.
+    """Return the edges (s, 2, 3) of the lattice's outer cell faces, m, insert frame.
 
-    The cells have the scene's resolution, whichever contact model was run. The result is empty
-    without [contact].
+    The cells have the scene's resolution, for any contact model. The result is empty without
+    contact.
 
     Raises:
         InputError: the insert cannot be meshed.
@@ -130,7 +130,7 @@ def lattice_lines(case: Case) -> Array:
 
 
 def readings(results: "Results", axis: HorizontalAxis) -> tuple[Reading, ...]:
-    """Return the numbers to display, without those that no frame has."""
+    """Return the numbers to display. Numbers that are NaN in all frames are left out."""
     weight = body_weight(results)
 
     def number(name: str, values: Array, unit: str, digits: int = 0) -> Reading:
@@ -167,13 +167,13 @@ def readings(results: "Results", axis: HorizontalAxis) -> tuple[Reading, ...]:
 
 
 def frame_labels(axis: HorizontalAxis) -> tuple[str, ...]:
-    """Return the place of each frame in the motion, in words."""
+    """Return the position of each frame in the motion as text."""
     words = {"flexion": "{} of flexion", "cycle": "{} of the cycle", "time": "{}"}[axis.kind]
     return tuple(words.format(axis.at(k)) for k in range(len(axis.values)))
 
 
 def _reading(name: str, write: Callable[..., str], *columns: Array) -> Reading:
-    """Return one text per frame; "–" if no column has a number."""
+    """Return a text per frame. It is "–" if all columns are NaN in the frame."""
     return Reading(
         name,
         tuple(
@@ -188,7 +188,7 @@ def _magnitude(results: "Results", stem: str) -> Array:
 
 
 def _direction(positive: str, negative: str) -> Callable[[float], str]:
-    """Return a function that writes an angle (deg) with its direction as a word, not a sign."""
+    """Return a function that writes an angle (deg) without sign, with its direction as a word."""
     return lambda angle: f"{abs(angle):.1f}° {positive if round(angle, 1) >= 0 else negative}"
 
 

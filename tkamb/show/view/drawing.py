@@ -1,7 +1,7 @@
 """Data of a drawing in the insert frame, for every frame of the motion.
 
-There are f frames. x is anterior, y superior, z lateral; the page mirrors a left knee back. A
-position of NaN hides an object in that frame. Arrays with a first axis of 1 are static.
+There are f frames. x is anterior, y superior, z lateral, also of a left knee, which the page
+mirrors. A position of NaN hides an object in that frame. Arrays with a first axis of 1 are static.
 
 The colour scales are viridis and scales of ColorBrewer (Brewer 2002). They are stored as bytes in
 an asset, because importing matplotlib takes 0.1 s.
@@ -160,8 +160,7 @@ class Arrow:
         colour: colour "#rrggbb".
         points: points of application, m, shape (f, 3).
         forces: forces, N, shape (f, 3).
-        ends_there: True: the arrow ends at the point (compression). False: it starts there
-            (tension).
+        ends_there: whether the arrow ends at its point (compression) or starts at it (tension).
         meaning: text of the legend on the body that the force acts on.
     """
 

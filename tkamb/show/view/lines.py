@@ -1,6 +1,6 @@
 """Lines and arrows of a drawing: ligaments, tendons, muscles, centres of pressure and forces.
 
-The size of a force comes from results.csv, its line of action from the geometry of the frame.
+The magnitude of a force comes from results.csv, its line of action from the geometry of the frame.
 """
 
 from collections.abc import Callable, Sequence
@@ -44,7 +44,7 @@ class ArrowSettings:
     """Arrows of the viewer."""
 
     contact_point_radius: float = 0.6 * MILLIMETRE
-    """m; radius of the sphere at a centre of pressure. Chosen by eye."""
+    """m: radius of the sphere at a centre of pressure. Chosen by eye."""
 
 
 ARROW = ArrowSettings()
@@ -149,7 +149,7 @@ def _extensor(results: "Results", geometries: Sequence[KneeGeometry]) -> list[Ar
 
 
 def _distal_end(geometry: KneeGeometry, name: str) -> tuple[Array, Array]:
-    """Return a tendon's distal end (3,) m, and the force (3,) there at a tension of one newton."""
+    """Return the distal end (3,) of a tendon, m, and its force (3,) there per N of tension."""
     if geometry.extensor is None:
         return NOTHING, NOTHING
     (muscle,) = geometry.muscles
@@ -184,13 +184,13 @@ def _condyles(
     arrows = []
     for side in ("medial", "lateral"):
         points = np.stack([_condyle_point(one, side) for one in geometries])
-        ways = np.stack(
+        directions = np.stack(
             [
                 one.condyles[side].direction(friction) if side in one.condyles else NOTHING
                 for one in geometries
             ]
         )
-        forces = -results[f"{side}_force_equilibrium_N"][:, None] * ways
+        forces = -results[f"{side}_force_equilibrium_N"][:, None] * directions
         name = f"{side} condyle"
         arrows.append(Arrow(name, FORCE_COLOURS[name], points, forces, True, "on the insert"))
     return arrows
@@ -211,15 +211,16 @@ halved if there are more than `many_bundles` bundles."""
 
 @dataclass(frozen=True)
 class ViewStrandSettings:
-    """Look of muscles and ligaments in the viewer."""
+    """Style of muscles and ligaments in the viewer."""
 
     muscle_radius: float = 2.0 * MILLIMETRE
-    """m; radius of a muscle's tube. Chosen by eye."""
+    """m: radius of a muscle's tube. Chosen by eye."""
     slack_force: float = 1.0
-    """N: a tendon or muscle with a smaller force is grey. Chosen because it is negligible."""
+    """N: a tendon or muscle with a smaller force is grey. Chosen because this force is
+    negligible."""
     least_activation: float = 0.1
-    """1: smallest upper end of the colour scale of activations. Chosen because small activations then
-    look small."""
+    """1: smallest upper end of the colour scale of activations. Chosen because small activations
+    then look small."""
     many_bundles: int = 20
     """Number of ligament bundles above which their radius is halved. Chosen because thick bundles
     would cover each other."""
@@ -297,8 +298,8 @@ def muscle_strands(geometries: Sequence[KneeGeometry]) -> tuple[tuple[Strand, ..
             ends[k, :, 0] = transform(one.state.pose("tibia"), share.lines.shank)
             ends[k, :, 1] = transform(one.state.pose("femur"), share.lines.thigh)
             activation[k], force[k] = share.activation[share.crossing], share.force[share.crossing]
-    known = np.isfinite(activation)
-    limit = float(np.max(activation, initial=VIEW_STRAND.least_activation, where=known))
+    finite = np.isfinite(activation)
+    limit = float(np.max(activation, initial=VIEW_STRAND.least_activation, where=finite))
     colours = activation_colours(np.where(force < VIEW_STRAND.slack_force, 0.0, activation), limit)
     strands = tuple(
         Strand(

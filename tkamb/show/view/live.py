@@ -35,9 +35,9 @@ logger = logging.getLogger("tkamb")
 
 
 def parametric_insert(case: Case, folder: Path) -> Insert | None:
-    """Return the design of a case's insert; None if its mesh does not come from a design.
+    """Return the parametric design of a case's insert; None: its mesh does not come from a design.
 
-    The design is `DESIGN_FILE` beside the mesh. It must reproduce this mesh byte for byte.
+    The design is the file `DESIGN_FILE` beside the mesh. It must reproduce this mesh exactly.
 
     Args:
         case: case with [contact].
@@ -49,8 +49,8 @@ def parametric_insert(case: Case, folder: Path) -> Insert | None:
         return None
     try:
         insert = load_design(table.mesh.parent).insert
-        made = write_insert(insert, insert.thickness, folder)
-        if made.read_bytes() == table.mesh.read_bytes():
+        copy = write_insert(insert, insert.thickness, folder)
+        if copy.read_bytes() == table.mesh.read_bytes():
             return insert
         logger.warning(
             "%s: not the mesh of %s beside it: no thickness slider", table.mesh, DESIGN_FILE
@@ -77,7 +77,7 @@ def with_thickness(case: Case, insert: Insert, thickness_mm: float, folder: Path
         case: case with [contact].
         insert: design of its insert.
         thickness_mm: smallest thickness, mm.
-        folder: folder for the mesh; it must exist as long as the case is used.
+        folder: folder for the mesh. It must exist as long as the case is used.
     """
     return with_insert(case, write_insert(insert, thickness_mm, folder))
 
@@ -97,7 +97,7 @@ class LiveAnswer:
 
     Args:
         request: the computed state.
-        numbers: name with unit -> value; NaN if the value is not defined.
+        numbers: name with unit -> value; NaN: the value is not defined.
         status: "ok", flags in plain words, or "failed: " and the reason.
         pose: (4, 4) pose_femoral_in_insert; NaN if the state failed.
         points: (n, 3) m, points of the pressure map, insert frame.
@@ -121,7 +121,7 @@ class LiveAnswer:
 
     @property
     def failed(self) -> bool:
-        """Whether there are no numbers."""
+        """Whether the computation failed, so that there are no numbers."""
         return self.status.startswith("failed: ")
 
 
@@ -132,8 +132,8 @@ class LiveKnee:
 
     Args:
         case: case of a scene with [contact].
-        own: folder for the files of this session; None: a new folder. It is removed with this
-            object. A saved scene has copies of its meshes.
+        session: folder for the files of this session; None: a new folder. It is removed with this
+            object. A saved scene has copies of the meshes in it.
 
     Attributes:
         design: design of the insert; None if its mesh does not come from a parametric design.
@@ -142,18 +142,18 @@ class LiveKnee:
         InputError: the scene has no [contact], or is scaled.
     """
 
-    def __init__(self, case: Case, own: Path | None = None) -> None:
+    def __init__(self, case: Case, session: Path | None = None) -> None:
         if case.scene.contact is None:
             raise InputError("has no [contact]", "scene", "tkamb live shows contact: add the table")
         if case.scene.patient.scale != 1.0:
             raise InputError("is scaled", "[patient] scale", "tkamb live needs scale = 1")
         self.case = _without_muscles(case)
         self.bench = Bench(self.case, mechanics_of(self.case, near=True).ligaments)
-        self._own = own or Path(tempfile.mkdtemp(prefix="tkamb-live-"))
-        weakref.finalize(self, shutil.rmtree, self._own, True)
-        self.design = parametric_insert(case, self._own)
+        self._session = session or Path(tempfile.mkdtemp(prefix="tkamb-live-"))
+        weakref.finalize(self, shutil.rmtree, self._session, True)
+        self.design = parametric_insert(case, self._session)
         self._cases: dict[float | None, Case] = {}
-        self._known: dict[float | None, SharedState] = {}
+        self._shared: dict[float | None, SharedState] = {}
         self._sides: dict[Setting, ContactSide] = {}
         self._threads: dict[Setting, Thread] = {}
         self._refused: dict[Setting, TkambError] = {}
@@ -168,7 +168,7 @@ class LiveKnee:
         """Return the bench at a recorded frame, under one body weight.
 
         Raises:
-            InputError: no such frame.
+            InputError: the motion has no such frame.
         """
         motion, table = self.case.motion, self.case.scene.contact
         if not 0 <= frame < len(motion.time):
@@ -200,7 +200,7 @@ class LiveKnee:
 
         A new thread prepares the model, because a lattice takes seconds. Requests for other models
         are computed meanwhile. If `most_threads` threads run already, no thread is started. The
-        page then repeats its request, so a setting that the user has left is not prepared.
+        page repeats its request until the model is ready.
 
         Raises:
             InputError: the model cannot be prepared.
@@ -238,13 +238,13 @@ class LiveKnee:
     ) -> LiveAnswer:
         """Return the answer to a request.
 
-        The previous state is the initial guess. It changes the answer of a lattice only within
+        The previous state is the initial guess. The initial guess changes the result only within
         the tolerance of the solver.
 
         Args:
             request: state of the bench.
             number: number from `overtake`; None: newer requests do not cancel this one.
-            from_rest: whether to start without an initial guess, as the first frame of `tkamb run`.
+            from_rest: whether to start without an initial guess, like the first frame of a run.
 
         Raises:
             TkambError: a newer request has arrived.
@@ -274,7 +274,7 @@ class LiveKnee:
             with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".tkamb-live-") as beside:
                 whole = Path(beside) / folder.name
                 whole.mkdir()
-                write_bench(self._still_case(request), whole, self._own)
+                write_bench(self._still_case(request), whole, self._session)
                 whole.replace(folder)
         except OSError as error:
             raise InputError(f"cannot be written ({error.strerror})", folder) from None
@@ -296,7 +296,7 @@ class LiveKnee:
             raise InputError("of no parametric design", "thickness_mm", "leave it out")
         if thickness_mm not in self._cases:
             self._cases[thickness_mm] = with_thickness(
-                self.case, self.design, thickness_mm, self._own
+                self.case, self.design, thickness_mm, self._session
             )
         return self._cases[thickness_mm]
 
@@ -307,13 +307,13 @@ class LiveKnee:
             side = self._sides.get(key)
         if side is None:
             case = self.bench.case_of(request, like=self._case_with(insert))
-            mechanics = mechanics_of(case, self._known.get(insert), near=True)
+            mechanics = mechanics_of(case, self._shared.get(insert), near=True)
             side = contact_side(case, mechanics)
         with self._counting:
-            if insert not in self._known:
+            if insert not in self._shared:
                 contact = side.mechanics.knee.contact
                 assert contact is not None  # a case on the bench has contact
-                self._known[insert] = SharedState(contact.pair, None, None, range(ROWS))
+                self._shared[insert] = SharedState(contact.pair, None, None, range(ROWS))
             self._sides.pop(key, None)
             self._sides[key] = side  # the order of use: the latest is last
             self._forget()
@@ -327,17 +327,17 @@ class LiveKnee:
         for old in [*self._refused][: -BENCH_LIMIT.kept_models]:
             del self._refused[old]
         needed = {thickness for _, _, thickness in (*self._sides, *self._threads)}
-        for inserts in (self._cases, self._known):
+        for inserts in (self._cases, self._shared):
             for thickness in inserts.keys() - needed:
                 del inserts[thickness]
 
     def _compute(self, request: BenchRequest) -> LiveAnswer:
         prepared = self._side(request)
         state = prepared.state
-        nothing = np.zeros(len(state.points))
+        zeros = np.zeros(len(state.points))
         empty = LiveAnswer(
-            request, {}, "", np.full((4, 4), np.nan), state.points, state.triangles, nothing,
-            np.full(len(nothing), np.inf), {}, {},
+            request, {}, "", np.full((4, 4), np.nan), state.points, state.triangles, zeros,
+            np.full(len(zeros), np.inf), {}, {},
         )  # fmt: skip
         case = self._still_case(request)
         if not np.isfinite(case.motion.coordinates).all():
@@ -345,8 +345,8 @@ class LiveKnee:
             return replace(empty, status=words)
         key = setting(request)
         try:
-            ready, known = prepared.mechanics.knee.contact, self._known[request.thickness_mm]
-            mechanics = mechanics_of(case, known, near=True, contact=ready)
+            ready, shared = prepared.mechanics.knee.contact, self._shared[request.thickness_mm]
+            mechanics = mechanics_of(case, shared, near=True, contact=ready)
             side = contact_side(case, mechanics, sensitivity=False)
             before = [self._before[key]] if key in self._before and not request.released else []
             body, contact = side.frame(0, before)
@@ -386,8 +386,8 @@ class LiveKnee:
         assert scene.contact is not None
         if scene.material is not None:
             return as_json(None)
-        own = request.contact == scene.contact.model
-        options = scene.contact.options if own else {}
+        same_model = request.contact == scene.contact.model
+        options = scene.contact.options if same_model else {}
         material = scene.contact.material
         return as_json(known_error(request.contact, request.resolution_mm, material, options))
 
@@ -395,7 +395,7 @@ class LiveKnee:
 def _numbers(
     body: FrameLoads, contact: FrameContact, mechanics: Mechanics, ends: dict[str, Array]
 ) -> dict[str, float]:
-    """Return the numbers of the bench, with the names of results.csv where it has them."""
+    """Return name -> number. Numbers that results.csv also has use its column names."""
     result = contact.result
     assert result is not None
     numbers = {

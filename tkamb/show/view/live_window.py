@@ -49,9 +49,9 @@ SCRIPTS = ("scene.js", "moving.js", "controls.js", "live.js")
 COARSE = ("foundation", 2.0)
 """Contact model and spacing (mm) that are used while a slider moves."""
 STRAIN_LIMIT = 0.1
-"""Top of the colour scale of the ligaments' strain."""
+"""1: upper end of the colour scale of ligament strains."""
 SCALES_MPA = (5.0, 10.0, 20.0, 30.0, 50.0, 80.0, 120.0, 200.0, 500.0, 1000.0)
-"""Possible tops of the colour scale. The smallest one above the peak pressure is used."""
+"""MPa: possible upper ends of the pressure scale. The smallest one above the peak is used."""
 
 
 class LiveWindow:
@@ -102,7 +102,7 @@ class LiveWindow:
             return self._packed(self.knee.answer(request, number))
         if name == "save":
             return self._keep(BenchRequest.read(content))
-        raise TkambError("no such question")
+        raise TkambError("no such request")
 
     def page(self) -> str:
         """Return the page. It works only with the server."""
@@ -194,12 +194,11 @@ class LiveWindow:
             return f"its error is {error} at this spacing"
         return (
             f"on the studied cases its error is at most {100 * error['peak_pressure']:.2g} % in "
-            f"peak "
-            f"pressure, {100 * error['area']:.2g} % in area"
+            f"peak pressure, {100 * error['area']:.2g} % in area"
         )
 
     def _keep(self, request: BenchRequest) -> bytes:
-        """Return the answer that a run of the saved scene gives, with the scene's file.
+        """Save the state as a scene; return its answer without an initial guess and its file.
 
         Raises:
             NotYet: the contact model is being prepared.
@@ -228,8 +227,8 @@ class LiveWindow:
         ghost = ("recorded femoral component", "recorded pose", case.femoral, RECORDED, 0.12)
         coarse = replace(self.start, contact=COARSE[0], resolution_mm=COARSE[1])
         answer = self.knee.answer(coarse)
-        nothing = np.zeros((1, len(answer.points)))
-        nowhere = np.full((1, 3), np.nan)
+        zeros = np.zeros((1, len(answer.points)))
+        hidden = np.full((1, 3), np.nan)
         colour = np.tile(rgb(SLACK), (1, 2, 1))
         return Drawing(
             title="on the bench",
@@ -251,10 +250,10 @@ class LiveWindow:
             ),
             arrows=(),
             markers=tuple(
-                Marker(f"{side} centre", "contact points", SIDE_COLOURS[side], nowhere, 8e-4)
+                Marker(f"{side} centre", "contact points", SIDE_COLOURS[side], hidden, 8e-4)
                 for side in SIDES
             ),
-            map=PressureMap(answer.points, answer.triangles, nothing, nothing + 1.0),
+            map=PressureMap(answer.points, answer.triangles, zeros, zeros + 1.0),
             strain_limit=STRAIN_LIMIT,
         )
 
@@ -315,7 +314,7 @@ def bench_of_knee(knee: Knee, q: Any) -> LiveKnee:
 
     Args:
         knee: knee with a named contact model.
-        q: configuration (nq,), or one per value of the slider "recorded frame", (f, nq).
+        q: configuration (nq,), or configurations (f, nq) for the slider "recorded frame".
 
     Raises:
         InputError: the knee has no contact model or one without a name, q has another size, or a
@@ -327,10 +326,10 @@ def bench_of_knee(knee: Knee, q: Any) -> LiveKnee:
     data = knee.create_data_for_kinematics()
     poses = np.array([knee.at(one, data).pose for one in np.atleast_2d(np.asarray(q, float))])
     coordinates = knee_coordinates(placement @ poses)
-    own = Path(tempfile.mkdtemp(prefix="tkamb-live-"))
+    session = Path(tempfile.mkdtemp(prefix="tkamb-live-"))
     try:
-        case = load_case(load_scene(write_knee(knee, placement, coordinates, own)))
+        case = load_case(load_scene(write_knee(knee, placement, coordinates, session)))
     except InputError:
-        shutil.rmtree(own, ignore_errors=True)
+        shutil.rmtree(session, ignore_errors=True)
         raise
-    return LiveKnee(replace(case, motion=still_motion(coordinates)), own)
+    return LiveKnee(replace(case, motion=still_motion(coordinates)), session)

@@ -48,7 +48,7 @@ INSTALL = "install chromium (Debian: apt install chromium)"
 
 
 def check_film(path: Path, option: str) -> None:
-    """Raise an InputError if a film cannot be made on this machine. This comes before any drawing.
+    """Raise an InputError if this machine cannot make a film. Call it before any drawing.
 
     Args:
         path: path of the film, .gif or .mp4.
@@ -72,12 +72,12 @@ def write_film(show: "Show", path: Path, progress: Progress = lambda frames: fra
     """Write a film of every frame at the speed of the motion.
 
     Args:
-        show: the drawings.
+        show: drawings of the runs.
         path: path of the film, .gif or .mp4.
         progress: function that wraps the frame indices, for example a progress bar.
 
     Raises:
-        InputError: as `check_film`, or the folder cannot be written.
+        InputError: a package or browser is missing, or the folder cannot be written.
         ComputationError: the page is not drawn, or the encoder fails.
     """
     times = max((one.times for one in show.drawings), key=len)
@@ -90,7 +90,7 @@ def write_film(show: "Show", path: Path, progress: Progress = lambda frames: fra
 
 
 def film_frames(html: str, count: int, progress: Progress) -> Iterator[bytes]:
-    """Yield a PNG of each frame of a page of `page_html`, with the look of `screenshot`."""
+    """Yield a PNG of each frame of a page of `page_html`, without its controls."""
     with tempfile.TemporaryDirectory(prefix="tkamb-film-") as folder, _playwright()() as driver:
         page_path = Path(folder) / "page.html"
         page_path.write_text(html, encoding="utf-8")
@@ -109,10 +109,10 @@ def film_frames(html: str, count: int, progress: Progress) -> Iterator[bytes]:
 
 
 def _write_gif(pictures: Iterator[bytes], path: Path, rate: float) -> None:
-    """Write a GIF. The 256 colours of each picture are spread evenly over the occurring colours.
+    """Write a GIF. The 256 colours of each picture are spread evenly over its range of colours.
 
-    The usual choice by frequency would give mostly greys of the background and wrong colour
-    scales."""
+    The usual choice of the most frequent colours would give mostly greys of the background.
+    """
     spread, plain = Image.Quantize.MAXCOVERAGE, Image.Dither.NONE
     first, *rest = (
         Image.open(io.BytesIO(one)).convert("RGB").quantize(256, method=spread, dither=plain)
@@ -178,7 +178,7 @@ class PageSettings:
     """Pictures of the viewer page by a browser."""
 
     timeout: float = 120.0
-    """s; time limit of the browser. Chosen because a page usually takes some seconds."""
+    """s: time limit of the browser. Chosen because a page usually takes some seconds."""
 
 
 PAGE = PageSettings()
@@ -192,11 +192,11 @@ def page_html(
     view: str = "oblique",
     live: Sequence[str] | None = None,
 ) -> str:
-    """Return the page.
+    """Return the HTML page of the viewer.
 
     Args:
         title: heading.
-        packed: the drawings (`tkamb.show.view.payload.pack`); None when a server gives them.
+        packed: drawings (`tkamb.show.view.payload.pack`); None: a server sends them.
         frame: frame at which the page opens.
         view: camera at the beginning.
         live: names of the contact models that the server offers; None without a server.
@@ -220,7 +220,7 @@ def page_html(
 
 
 def meshcat_script() -> str:
-    """Return meshcat's viewer, three.js included, as its package ships it."""
+    """Return the JavaScript of meshcat's viewer, with three.js."""
     root = Path(meshcat.__file__).parent
     return (root / "viewer" / "dist" / "main.min.js").read_text(encoding="utf-8")
 
@@ -243,11 +243,11 @@ def screenshot(html: str, size: tuple[int, int]) -> bytes:
     """Return a PNG of a self-contained page of `page_html`, without its controls.
 
     Args:
-        html: the page.
-        size: width and height in pixels.
+        html: HTML of the page.
+        size: width and height, pixels.
 
     Raises:
-        ComputationError: no browser, or the page does not become ready.
+        ComputationError: no browser is installed, or it does not draw the page.
     """
     browser = find_browser()
     with tempfile.TemporaryDirectory(prefix="tkamb-view-", ignore_cleanup_errors=True) as folder:

@@ -1,4 +1,4 @@
-"""Drawings as one compressed block of bytes, the same for the live window and for a file.
+"""Drawings as one compressed block of bytes, for the live window and for HTML files.
 
 Layout before compression by gzip: the length of the header (uint32, little-endian), the header
 (JSON, padded to 4 bytes), then the arrays. In the header an array is {"at": byte, "of": element
@@ -79,7 +79,7 @@ class Shaded:
 
 @lru_cache(maxsize=16)
 def shade(surface: Surface, most_triangles: int = SHADING.max_triangles) -> Shaded:
-    """Return a surface for drawing. Vertices on sharp edges occur once per adjacent side."""
+    """Return a surface for drawing. A vertex on a sharp edge occurs once per normal."""
     surface, error = decimate(surface, most_triangles)
     normals = surface.corner_normals
     flat = np.repeat(surface.face_normals[:, None], 3, axis=1)
@@ -149,7 +149,7 @@ TYPES = {"float32": np.float32, "uint8": np.uint8, "int16": np.int16, "uint32": 
 
 
 class Block:
-    """Arrays in the layout that the module describes."""
+    """Arrays of a block under construction; see the layout above."""
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []
@@ -181,7 +181,7 @@ class Block:
 
 
 def pack(drawings: Sequence[Drawing]) -> bytes:
-    """Return the drawings, shown side by side, on common colour scales."""
+    """Return the block of drawings that are shown side by side, with common colour scales."""
     block = Block()
     peak = peak_pressure(drawings)
     limit = max(one.strain_limit for one in drawings)
@@ -217,7 +217,7 @@ def packed_map(pressure_map: PressureMap, peak: float, words: str) -> bytes:
 
 
 def packed_lattice(lines: Array) -> bytes:
-    """Return the lines (s, 2, 3) m of a lattice alone."""
+    """Return the block of the edges (s, 2, 3) of a lattice, m."""
     block = Block()
     return block.compress({"lattice": block.put(lines, "float32")})
 
@@ -308,8 +308,8 @@ def map_levels(pressure_map: PressureMap, peak: float) -> NDArray[np.int16]:
     """Return the pressure level (f, n) of each point as an integer, at least 1 if loaded.
 
     Args:
-        pressure_map: the map.
-        peak: top of the colour scale, MPa. A higher pressure has the top level.
+        pressure_map: pressure map of all frames.
+        peak: upper end of the colour scale, MPa. A higher pressure has the highest level.
     """
     level = pressure_levels(pressure_map.pressure, pressure_map.gap, pressure_map.triangles, peak)
     whole = np.maximum(np.round(np.abs(level) * VIEW_PAYLOAD.pressure_levels), 1.0)
@@ -317,7 +317,10 @@ def map_levels(pressure_map: PressureMap, peak: float) -> NDArray[np.int16]:
 
 
 def _insert_transform(root: str, side: str) -> SetTransform:
-    """Return the transform (4, 4) from the insert frame to meshcat's; it mirrors a left knee."""
+    """Return the command for the pose of the insert frame in meshcat, whose z is up.
+
+    It mirrors a left knee.
+    """
     turn = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
     if side == "left":
         turn = turn @ np.diag([1.0, 1.0, -1.0, 1.0])

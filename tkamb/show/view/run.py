@@ -30,8 +30,8 @@ class CaseResults:
     """A case and the results that belong to it.
 
     Args:
-        case: the scene with its files read.
-        mechanics: multibody model of the case; its geometry is drawn.
+        case: content of the scene and its files.
+        mechanics: multibody model of the case, which gives the geometry of the drawing.
         results: results of the case.
         frames: index of the motion's frame for each row of the results.
     """
@@ -45,8 +45,8 @@ class CaseResults:
         """Return the geometry of the knee's equations for every frame.
 
         The contact points of condyles and patella come from the maps of the run, or are computed
-        again. If knee and contact are coupled, both are solved again, because the points of action
-        come from the contact.
+        again. If knee and contact are coupled, both are solved again, because the contact
+        determines the points of action.
         """
         contact = self.case.scene.contact
         if contact is None or (contact.coupling == "none" and not contact.released):
@@ -92,10 +92,10 @@ class Source:
     """Content of a path: results and their case, or a case that has not been run.
 
     Args:
-        path: a folder that `tkamb run` wrote, or a scene file.
-        case: the scene with its files read.
+        path: folder that `tkamb run` wrote, or scene file.
+        case: content of the scene and its files.
         results: results of the case; None: it has not been run.
-        kept: the folder in which a scene's own results were found.
+        kept: folder with the results of a scene file; None: no such folder, or `path` is a folder.
     """
 
     path: Path
@@ -115,8 +115,8 @@ class Source:
         """Return the run. It is computed first if there are no results.
 
         Args:
-            progress: wraps the frame indices of a run.
-            announce: takes a line for the user.
+            progress: function that wraps the frame indices, for example a progress bar.
+            announce: function that prints a line for the user.
 
         Raises:
             InputError: the scene cannot be run, or has changed since the run.
@@ -131,7 +131,7 @@ class Source:
 
 
 def read_source(path: str | Path, contact: str | None = None) -> Source:
-    """Return the content of a results folder or a scene file; nothing is run.
+    """Return the content of a results folder or a scene file, without a run.
 
     If a scene's output folder has results of this scene, the source has these results.
 
@@ -177,7 +177,7 @@ def open_run(
 
 
 def check_frame(sources: Sequence[Source], frame: int) -> None:
-    """Raise an InputError if no run has the frame. This comes before any run or drawing.
+    """Raise an InputError if no run has the frame. Call it before any run or drawing.
 
     Args:
         sources: sources of the runs.
@@ -213,7 +213,7 @@ def match_frames(case: Case, results: Results) -> CaseResults:
 
 
 def run_of_results(results: Results) -> CaseResults:
-    """Return the run of results, whose summary names the scene.
+    """Return the run of results. The scene is read from the path in their summary.
 
     Raises:
         InputError: the scene is missing, or has changed since the run.

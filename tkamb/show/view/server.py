@@ -1,8 +1,8 @@
-"""The server of the live window, and contact of one frame by another model on request.
+"""The server of the viewer's window, and contact of one frame by another model on request.
 
 The server accepts connections from this machine alone, and sends only the page and its data. Other
-users of the machine can connect too. So every address begins with a random token, which only
-the user's terminal shows.
+users of the machine can connect too. Therefore every address begins with a random token, which
+only the user's terminal shows.
 """
 
 import argparse
@@ -136,8 +136,8 @@ class ContactSwitch:
         points, triangles = side.state.points, side.state.triangles
         result = contact.result
         if result is None:
-            nothing = PressureMap(points, triangles, *np.zeros((2, 1, len(points))))
-            return packed_map(nothing, self.peak, f"{model}: {contact.problem}")
+            no_pressure = PressureMap(points, triangles, *np.zeros((2, 1, len(points))))
+            return packed_map(no_pressure, self.peak, f"{model}: {contact.problem}")
         pressure_map = PressureMap(
             points, triangles, result.pressure[None] / MEGAPASCAL, result.gap[None]
         )
@@ -158,8 +158,8 @@ class ContactSwitch:
         if model not in self._sides:
             case = self.run.case
             assert case.scene.contact is not None
-            own = model == case.scene.contact.model
-            changes = {"model": model} if own else {"model": model, "options": {}}
+            same_model = model == case.scene.contact.model
+            changes = {"model": model} if same_model else {"model": model, "options": {}}
             table = case.scene.contact.model_copy(update=changes)
             case = replace(case, scene=case.scene.model_copy(update={"contact": table}))
             other = contact_model(table.model, table.resolution_mm, **table.options)
@@ -175,16 +175,16 @@ class NotYet(TkambError):
 class ViewServer:
     """Server of one page on the loopback address.
 
-    Requests under another host name (DNS rebinding), from another site, or without the token in
-    their address are refused.
+    The server refuses requests under another host name (DNS rebinding), from another site, or
+    without the token in their address.
 
     Args:
-        html: the page.
-        packed: the compressed drawings.
-        switch: source of results by other contact models; None: only the drawings.
+        html: HTML of the page.
+        packed: compressed drawings.
+        switch: source of results by other contact models; None: the page has only the drawings.
         port: port of the server; 0: any free port.
-        bench: function of the name and content of a message of `tkamb live` that returns the
-            answer; None: no such messages.
+        bench: function that returns the answer to a request of `tkamb live` from its name and
+            content; None: the page is not that of `tkamb live`.
 
     Raises:
         InputError: the port is taken.
@@ -215,8 +215,8 @@ class ViewServer:
         except (OSError, OverflowError) as error:
             raise InputError(f"cannot listen ({error})", f"{HOST}:{port}", "--port 0") from None
         self._server.daemon_threads = True
-        own = self._server.server_address[1]
-        Handler.names = {f"{name}:{own}" for name in (HOST, "localhost")}
+        bound_port = self._server.server_address[1]
+        Handler.names = {f"{name}:{bound_port}" for name in (HOST, "localhost")}
 
     @property
     def url(self) -> str:
@@ -224,11 +224,11 @@ class ViewServer:
         return f"http://{HOST}:{self._server.server_address[1]}/{self._token}/"
 
     def _repr_html_(self) -> str:
-        """Return a link, which a notebook shows."""
+        """Return a link for notebooks."""
         return f'<a href="{self.url}" target="_blank" rel="noopener">{self.url}</a>'
 
     def serve(self) -> None:
-        """Answer until `close`, or until the user interrupts."""
+        """Answer requests until `close`, or until the user interrupts."""
         self._server.serve_forever(poll_interval=0.2)
 
     def close(self) -> None:
@@ -265,7 +265,7 @@ class _Handler(BaseHTTPRequestHandler):
         return good
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Answer a request that the library refuses with one line and all headers."""
+        """Answer a request that `http.server` refuses, with one line and all headers."""
         self.request_version = "HTTP/1.0"
         self.close_connection = True
         status = HTTPStatus(code)
@@ -284,26 +284,24 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse()
             return
         try:
-            answer = self._answer(self._question())
+            answer = self._answer(self._read_request())
         except NotYet as error:
             self._send_line(HTTPStatus.ACCEPTED, error.what)
         except TimeoutError:
-            self._send_line(HTTPStatus.REQUEST_TIMEOUT, "the question did not arrive")
+            self._send_line(HTTPStatus.REQUEST_TIMEOUT, "the request did not arrive")
         except (TkambError, ValueError, KeyError, RecursionError) as error:
             self._send_line(HTTPStatus.BAD_REQUEST, str(error) or type(error).__name__)
-        except (
-            Exception
-        ) as error:  # the last handler: the page shows the error, and the server continues
+        except Exception as error:  # the page shows the error, and the server continues
             words = f"{type(error).__name__}: {error}"
             self._send_line(HTTPStatus.INTERNAL_SERVER_ERROR, words)
         else:
             self._send(HTTPStatus.OK, "application/octet-stream", answer)
 
-    def _answer(self, question: dict[str, Any]) -> bytes:
+    def _answer(self, content: dict[str, Any]) -> bytes:
         if self.bench is not None:
-            return self.bench(self._path_below_token, question)
+            return self.bench(self._path_below_token, content)
         if self.switch is not None and self._path_below_token == "contact":
-            frame, model = question["frame"], question["model"]
+            frame, model = content["frame"], content["model"]
             if type(frame) is not int or not isinstance(model, str):
                 raise TkambError("'frame' must be an integer, and 'model' a name")
             return self.switch.answer(frame, model)
@@ -314,7 +312,7 @@ class _Handler(BaseHTTPRequestHandler):
         if self.switch is not None and self._path_below_token == "cancel":
             self.switch.cancel()
             return b""
-        raise TkambError("no such question")
+        raise TkambError("no such request")
 
     def log_message(self, format: str, *args: Any) -> None:
         """Print nothing."""
@@ -324,14 +322,14 @@ class _Handler(BaseHTTPRequestHandler):
         """Return the part of the path after the token."""
         return self.path.removeprefix(self.root)
 
-    def _question(self) -> dict[str, Any]:
+    def _read_request(self) -> dict[str, Any]:
         length = int(self.headers.get("Content-Length") or 0)
         if not 0 < length <= VIEW_SERVER.most_request_bytes:
-            raise TkambError("the question has no bytes, or too many")
-        question = json.loads(self.rfile.read(length))
-        if not isinstance(question, dict):
-            raise TkambError("the question must be a JSON object")
-        return question
+            raise TkambError("the request has no bytes, or too many")
+        content = json.loads(self.rfile.read(length))
+        if not isinstance(content, dict):
+            raise TkambError("the request must be a JSON object")
+        return content
 
     def _is_allowed(self) -> bool:
         origin = self.headers.get("Origin")

@@ -1,4 +1,4 @@
-"""Show runs in a live window, as one file or as a picture."""
+"""Output of the viewer: a live window, an HTML file or a picture."""
 
 import os
 import sys
@@ -35,10 +35,10 @@ class Show:
         camera: one of CAMERAS.
         lattice: whether the cells of the lattice are drawn too. The live window draws them when
             the user switches their layer on.
-        progress: wraps the frame indices while the drawings are made.
+        progress: function that wraps the frame indices, for example a progress bar.
 
     Raises:
-        InputError: no such frame or camera.
+        InputError: no run has the frame, or the camera does not exist.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class Show:
         """Return the same drawings with another first frame and camera.
 
         Raises:
-            InputError: no such frame or camera.
+            InputError: no run has the frame, or the camera does not exist.
         """
         other = copy(self)
         other.frame, other.camera = self._check(frame, camera)
@@ -71,7 +71,7 @@ class Show:
         return page_html(self.title, self.packed, frame=self.frame, view=self.camera)
 
     def write_html(self, path: str | Path) -> None:
-        """Write the self-contained page, whole or not at all.
+        """Write the self-contained page.
 
         Raises:
             InputError: the folder cannot be written.

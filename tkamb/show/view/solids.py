@@ -1,9 +1,8 @@
 """The rigid parts of a drawing: implant, patella, bones as plain solids, floor and foot.
 
-If a muscle wraps around the mesh of a bone, this mesh is drawn. The other bones are simple bodies
-of about the right size between the joint centres; they only help orientation. The pose of the foot
-is not measured. The foot is drawn level with the floor and points forward with the shank, so the
-arrow of the ground reaction starts at a foot.
+If a muscle wraps around the mesh of a bone, this mesh is drawn. All other bones are simple bodies
+of about the right size between the joint centres. They only help orientation. The pose of the foot
+is not measured. The foot is drawn level with the floor and points forward with the shank.
 """
 
 from collections.abc import Sequence
@@ -41,7 +40,7 @@ FEMUR_PROFILE = (
     (1.0, 20.0),
 )
 TIBIA_PROFILE = ((0.0, 26.0), (0.05, 24.0), (0.16, 15.0), (0.50, 11.0), (0.85, 11.0), (1.0, 18.0))
-"""Pairs of distance from the knee, as a share of the tibia's length, and radius, mm."""
+"""Pairs of distance from the knee, as a share of the bone's length, and radius, mm."""
 
 PATELLA_DEPTH, PATELLA_WIDTH = 8.0 * MILLIMETRE, 21.0 * MILLIMETRE
 
@@ -85,15 +84,15 @@ def solids(
 ) -> tuple[Solid, ...]:
     """Return the solids of a case.
 
-    The femoral component has the pose that the contact model found, and the pose of `states` in
-    frames without a map.
+    The femoral component has the pose of the contact model. In frames without a map it has the
+    pose of `states`.
 
     Args:
-        case: the case.
-        recorded: measured pose_femur_in_insert, shape (f, 4, 4).
+        case: case of the run.
+        recorded: recorded pose_femur_in_insert, shape (f, 4, 4).
         states: state of the chain in each frame.
-        maps: pressure maps of the run, with the pose of each.
-        rows: row of the map of each frame; -1 for a frame without a map.
+        maps: pressure maps of the run, each with the pose of the femoral component.
+        rows: row of the map of each frame; -1: the frame has no map.
     """
     solved = np.stack([state.pose("femur") for state in states])
     still = np.eye(4)[None]
@@ -130,8 +129,8 @@ def worn_insert(results: "Results", side: str) -> tuple[Solid, ...]:
     """Return the worn insert that `tkamb wear` wrote, coloured by wear depth; () if there is none.
 
     Args:
-        results: results of a run; their folder may have wear.vtp of the same scene.
-        side: side of the knee; the drawing of a left knee is mirrored, its file is not.
+        results: results of a run. Their folder may have wear.vtp of the same scene.
+        side: side of the knee. The drawing mirrors a left knee, wear.vtp does not.
 
     Raises:
         InputError: wear.json or wear.vtp cannot be read.
@@ -148,8 +147,8 @@ def worn_insert(results: "Results", side: str) -> tuple[Solid, ...]:
     return (Solid(surface.name, "worn insert", surface, INSERT, 1.0, np.eye(4)[None], depth),)
 
 
-def _contact_poses(recorded: Array, maps: ContactMaps | None, rows: Sequence[int]) -> Array:
-    poses = recorded.copy()
+def _contact_poses(without_map: Array, maps: ContactMaps | None, rows: Sequence[int]) -> Array:
+    poses = without_map.copy()
     if maps is not None:
         stored = maps.femoral_pose
         for frame, row in enumerate(rows):
@@ -206,9 +205,9 @@ def floor_and_foot(
     """Return floor, foot and centre of pressure; empty without a force plate.
 
     Args:
-        case: the case.
-        geometries: geometry of the frames.
-        frames: frames of the motion.
+        case: case of the run.
+        geometries: geometry of each frame.
+        frames: index of each frame in the motion.
     """
     table = case.scene.ground_reaction
     if case.ground is None or case.tibia is None or table is None or table.applied == "ankle":
@@ -287,25 +286,32 @@ def box(size: Array, name: str) -> Surface:
 
 
 def revolved(radius: Array, height: Array, name: str, sections: int = 28) -> Surface:
-    """Return a body of revolution about z with flat ends: radius (n,) at rising height (n,), m."""
+    """Return a body of revolution about z with flat ends.
+
+    Args:
+        radius: radii, m, shape (n,).
+        height: increasing z of the radii, m, shape (n,).
+        name: name of the surface.
+        sections: number of sides of the approximated circle.
+    """
     count, angle = len(radius), 2.0 * np.pi * np.arange(sections) / sections
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     around = np.concatenate(
         [radius[:, None, None] * ring, np.tile(height[:, None, None], (1, sections, 1))], axis=2
     )
     poles = [[0.0, 0.0, height[0]], [0.0, 0.0, height[-1]]]
-    here = np.arange(sections)
-    ahead = (here + 1) % sections
+    first = np.arange(sections)
+    second = (first + 1) % sections
     low = (sections * np.arange(count - 1))[:, None]
-    a, b, c, d = low + here, low + ahead, low + ahead + sections, low + here + sections
+    a, b, c, d = low + first, low + second, low + second + sections, low + first + sections
     bottom, top = count * sections, count * sections + 1
     last = (count - 1) * sections
     faces = np.concatenate(
         [
             np.stack([a, b, c], axis=2).reshape(-1, 3),
             np.stack([a, c, d], axis=2).reshape(-1, 3),
-            np.column_stack([np.full(sections, bottom), ahead, here]),
-            np.column_stack([np.full(sections, top), last + here, last + ahead]),
+            np.column_stack([np.full(sections, bottom), second, first]),
+            np.column_stack([np.full(sections, top), last + first, last + second]),
         ]
     )
     return Surface(np.concatenate([around.reshape(-1, 3), poles]), faces, name)
