@@ -191,7 +191,7 @@ def test_a_femur_beside_the_insert_fails_with_the_reason(bend):
 
 
 def test_a_frame_in_equilibrium_whose_equations_fail_has_no_numbers(monkeypatch):
-    """The frame has its inputs, times and numbers of the search; all other columns are NaN."""
+    """Only inputs, computing times and the statistics of the search have finite numbers."""
     overrides = COARSE | {"contact.released": ALL}
     solver = FrameSolver(load_case(load_scene(BEND, overrides)))
     monkeypatch.setattr(

@@ -55,7 +55,7 @@ def test_static_optimisation_and_equations_give_the_same_quadriceps(where):
 
 
 def test_flexors_supply_the_moment_that_a_slack_quadriceps_lacks():
-    """With the ground reaction in front, flexors reduce the missing moment to a reserve of 1 %."""
+    """The ground reaction is in front. Flexors supply its moment, except a reserve below 2 %."""
     knee = with_ground_force([0.06, -0.45, 0.0])
     alone = solve_knee(knee, FRICTION)
     geometry, loads = (
@@ -79,7 +79,7 @@ def test_muscles_without_strength_do_not_change_the_loads():
 
 
 def test_two_flexors_share_by_strength_and_the_arms_of_the_knee():
-    """Without reserve, the optimal activations a_i are proportional to R_i F_i."""
+    """Without reserve, optimal activations are proportional to moment arm times strength."""
     knee = with_ground_force(GROUND_POINTS["ahead"])
     trial = two_flexors(1, reserve=1e-3, least=0.0)
     share = SharedMuscles(trial).frame(0).share(knee, FRICTION, frozenset())

@@ -124,7 +124,8 @@ def test_a_ball_wears_a_plate_to_its_own_shape():
     points = case.articular.surface.vertices[case.articular.vertices] / MM
     distance = np.hypot(points[:, 0], points[:, 2])
     inside = distance < 0.6 * np.sqrt(2 * radius * cap)
-    height = radius - cap + state.wear[inside] / MM  # of the sphere's centre above the worn surface
+    # Height of the sphere's centre above the worn surface.
+    height = radius - cap + state.wear[inside] / MM
     assert np.hypot(height, distance[inside]) == pytest.approx(radius, abs=0.03)
 
 

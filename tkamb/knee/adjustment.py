@@ -46,7 +46,7 @@ class SplitSensitivitySettings:
 
     adduction_step: float = 0.02 * DEGREE
     """rad: step of the finite difference. Chosen because it shifts about 60 N between the condyles,
-    thirty times the lattice's tolerance, and 0.2 deg or more unload a condyle."""
+    thirty times the lattice's tolerance, but unloads no condyle (0.2 deg or more would)."""
 
 
 SPLIT_SENSITIVITY = SplitSensitivitySettings()
@@ -83,9 +83,10 @@ def split_sensitivity(
 def split_tangent(probe: "Probe", result: ContactResult) -> float:
     """Return the quantity of `split_sensitivity` from the contact's exact tangent, N/rad.
 
-    Let t be the tangent of a condyle's force on the insert, and n the medial contact normal. At a
-    constant superior-inferior load an adduction da lowers or lifts the femur by
-    dy = -(sum t_y,a / sum t_y,y) da. The medial force then changes by n . (t_a da + t_y dy).
+    Let t_a and t_y (3,) be the derivatives of a condyle's force on the insert with respect to
+    adduction a and height y, and n the medial contact normal (upward). At a constant
+    superior-inferior load an adduction da moves the femur by dy = -(sum t_a,y / sum t_y,y) da,
+    where ",y" is the y component. The medial force then changes by -n . (t_a da + t_y dy).
 
     Args:
         probe: probe of a contact model whose tangent is exact.
@@ -247,7 +248,8 @@ def _check(
     deeper = penetration - abs(adjustment.translation)
     angle_excess = (abs(angle) - abs(adjustment.coronal_angle)) * distance
     margin = settings.input_change
-    # If both angles are below the resolution of a mesh, restoring the rotation changes nothing.
+    # The margin matters only if the two angles are close to each other. If both are then below the
+    # resolution of a mesh, restoring the rotation changes nothing.
     tilted = abs(angle) * distance > settings.level_difference
     outcomes = {
         _restored(settings.restore_when, *exceeded)

@@ -120,7 +120,7 @@ class SolvedLoads:
         condition: condition number of the matrix with unit columns.
         lifted: sides that carry no load.
         slack: whether the extensor group carries no load, because it would have to push.
-        ambiguous: whether a second load state has no wrong sign either.
+        ambiguous: whether a second load state also has all signs right.
         problems: reasons why there is no solution; empty: there is a solution.
     """
 

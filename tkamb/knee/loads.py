@@ -42,7 +42,7 @@ class KneeLoads:
         condition: condition number of the equations.
         lifted: condyles that carry no load.
         slack: whether the extensor mechanism carries no load.
-        ambiguous: whether a second load state has no wrong sign either.
+        ambiguous: whether a second load state also has a solution with all signs right.
         problems: reasons why there is no solution; empty: there is a solution.
         external_forces: `pin.StdVec_Force` of contact, ligaments and extensor mechanism, as `fext`
             of the model. With these and the external loads `pin.rnea` gives the residuals at the

@@ -288,9 +288,9 @@ class CellContact(ContactModel):
     ) -> Solution:
         """Solve with the stored factor, and by Newton's method if this does not converge.
 
-        Newton's method is not tried if the gap is the larger residual, because nodes would
-        oscillate on the femoral surface again. It is not tried if the approach is larger than
-        `covered`, m, because the caller then adds candidates.
+        Newton's method is not tried if the gap residual is at least the force residual: the nodes
+        then oscillate on the femoral surface, and would do so with Newton's method too. It is not
+        tried if the approach is larger than `covered`, m, because the caller then adds candidates.
         """
         if self.newton:
             return solve_by_newton(problem, pose, load, guess, settings)

@@ -169,7 +169,7 @@ class Scatter:
     nodes: int
 
     def gather(self, displacement: Array, chosen: Index | None = None) -> Array:
-        """Return the chosen (by default all) elements' values (k, 3p) of nodal ones (n, 3)."""
+        """Return the nodal vectors (n, 3) of each chosen element, by default all, (k, 3p)."""
         elements = elements_of(self.elements, chosen)
         return displacement[elements].reshape(len(elements), 3 * elements.shape[1])
 
@@ -264,7 +264,10 @@ class Solid(ABC):
     @property
     @abstractmethod
     def stiffness(self) -> sparse.csr_matrix:
-        """Linear stiffness (3n, 3n), N/m, assembled at each access, as large as half the factor."""
+        """Linear stiffness (3n, 3n), N/m.
+
+        Each access assembles it anew. It takes half as much memory as the factor.
+        """
 
     @abstractmethod
     def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
@@ -278,7 +281,7 @@ class Solid(ABC):
     def forces(self, displacement: Array) -> tuple[Array, Array, float]:
         """Return the internal forces of a displacement (n, 3), m, summed element by element.
 
-        They measure the error of a solution, because no stored factor is involved.
+        They do not use the stored factor. So its rounding does not hide the error of a solution.
 
         Returns:
             Internal forces f(u) (n, 3), N; h = K u - f(u) of each element (k, 3p), N; and
@@ -315,7 +318,8 @@ class Solid(ABC):
         """Return the smallest principal strain of the mean strains of all cells.
 
         The size of a principal strain is at most the norm of the strain tensor. So the cell with
-        the largest norm is evaluated first. Cells with a norm below its compression are skipped.
+        the largest norm is evaluated first. Cells whose norm is below the largest compression of
+        this cell cannot have a smaller principal strain and are skipped.
         """
         strain = self.strain(displacement)
         norms = np.sqrt(np.einsum("kab,kab->k", strain, strain))

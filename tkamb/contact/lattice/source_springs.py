@@ -59,7 +59,7 @@ class SourceNetwork(Solid):
 
     Args:
         nodes: m, shape (n, 3).
-        cells: nodes of the cells, shape (c, 8), for the strains of the flags only.
+        cells: nodes of the cells, shape (c, 8). Only the strains that decide on flags need them.
         spacing: edges of a cell, m, shape (3,).
         material: E and the stress-strain curve; its Poisson's ratio has no effect.
         springs: end nodes of the springs, shape (s, 2).
