@@ -91,7 +91,11 @@ def _share(
     gap: Array,
     material: Material,
 ) -> Array:
-    """Return the share in contact of sides (m, 2) from a node in contact to one that is not."""
+    """Return the shares in contact (m, 2) of the two sides of each triangle that the edge cuts.
+
+    `inside` and `outside` (m, 2) are the ends of these sides in contact and out of contact.
+    """
+
     distance = np.linalg.norm(points[inside] - points[outside], axis=2)
     smooth = gap[outside] < distance
     opening = np.where(smooth, np.maximum(gap[outside], CONTACT_AREA.least_gap), distance)

@@ -4,9 +4,10 @@ Contact models press a femoral component along -y into an insert whose flat bott
 y = 0. A cam touches the post from behind. The post is therefore turned so that its posterior face
 faces up. In the insert frame (x anterior, y superior, z to the right) the turned axes are
 
-    x' = y,    y' = x_f - x,    z' = z,
+    x' = y - y_m,    y' = x_f - x,    z' = z - z_m,
 
-where x_f is the flat front of the post (`tkamb.geometry.post.divide_insert`). The posterior face
+where x_f is the flat front of the post (`tkamb.geometry.post.divide_insert`), and y_m and z_m are
+the middle of the post's bounding box. The posterior face
 then faces up along y'. The front is the fixed bottom of the layer, and the post's depth is the
 layer's thickness. The post does not bend at its root. The pair is evaluated at a given pose.
 

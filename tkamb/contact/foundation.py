@@ -37,7 +37,8 @@ class FoundationSettings:
     with a stiffness of about 1e8 N/m the reactions differ by 0.1 N."""
     reached_share: float = 0.99
     """1: a reaction below `reached_share` * load - `reached_force` cannot rise to the load within
-    `approach_step`. Chosen because the reaction jumps by less when map points come into contact."""
+    `approach_step`. Chosen because map points that come into contact within this step raise the
+    reaction by less than 1 % of the load."""
     reached_force: float = 1.0
     """N: see `reached_share`. Chosen: ten times the reaction's change within `approach_step`."""
 
@@ -49,7 +50,8 @@ OVER_THE_EDGE = (
     "the femoral component reaches over the insert's edge, deeper than half of its thickness there"
 )
 WIDEST_EDGE = NEAR
-"""m: upper limit of the change of the gap across one column (`FoundationProbe.smoothed`)."""
+"""m: upper limit of the range of gaps in which `FoundationProbe.smoothed` counts a column partly.
+The range is the change of the gap across the column."""
 SUMS = 46
 """Number of sums over the columns of one condyle; see `_add_up`."""
 

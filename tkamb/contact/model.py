@@ -1,8 +1,8 @@
 """The interface of every contact model (see docs/contact_model.md), and its probe.
 
 A contact model computes pressure and wrench from the pose of the femoral component in the insert.
-Its `prepare` does the work that depends on geometry alone. All vectors are in the insert frame (x
-anterior, y superior, z to the right), in SI units.
+Its `prepare` does the work that depends on geometry and material alone. All vectors are in the
+insert frame (x anterior, y superior, z to the right), in SI units.
 
 A `Probe` evaluates many neighbouring poses for a search of equilibrium.
 """

@@ -32,8 +32,8 @@ class PressSettings:
     max_approach: float = 0.02
     """m: largest approach of a search. Chosen because no insert carries a load beyond it."""
     least_bracket: float = 1e-16
-    """m: width of the bracket at which the search ends. Chosen: the rounding of an approach of
-    1 mm."""
+    """m: width of the bracket at which the search ends. Chosen because it is above the rounding of
+    an approach of 20 mm (3e-18 m)."""
     max_evaluations: int = 80
     """Largest number of evaluations of the reaction in one press. Bisection of `max_approach` to
     `least_bracket` needs 48."""
@@ -120,8 +120,8 @@ def press_by_search(
         load: superior-inferior force, N.
         pose: (4, 4) pose_femoral_in_insert.
         guess: earlier result or warm start; its approach is the initial guess of the search.
-        reaction: function that returns the reaction (N), minus the y component of the force on the
-            insert, at an approach (m), faster than `evaluate`; inf if out of range.
+        reaction: function that returns the reaction (N) at an approach (m), faster than `evaluate`;
+            inf if out of range. The reaction is the force on the insert along -y.
 
     Returns:
         The contact at the approach that carries the load. It is OUT_OF_RANGE, with NaN, if the load

@@ -31,8 +31,8 @@ class ContactResultSettings:
     curves of polyethylene end at 40 to 60 MPa, and the largest von Mises stress of a Hertz contact
     is about 0.6 of its peak pressure."""
     least_patch_share: float = 0.05
-    """1: smallest share of the force on a patch under a second condyle. Chosen because smaller
-    patches belong to the first condyle."""
+    """1: a patch that carries a smaller share of the force does not count as contact of a second
+    condyle. Chosen because such a patch is a fragment of the first condyle's contact."""
     least_patch_distance: float = 15.0 * MILLIMETRE
     """m: smallest distance between the centres of two condyles' patches. Chosen because condyles of
     a knee are 40 to 50 mm apart."""

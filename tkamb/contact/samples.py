@@ -28,9 +28,9 @@ class MapPointSettings:
     """1: smallest superior component of a normal by which a covered area is divided; a slope of 84
     deg. Chosen because it prevents a division by zero."""
     side_start_normal_y: float = 0.5
-    """1: superior component of a normal below which the start of a column may lie in the femur
-    beside the point; a slope of 60 deg. Chosen because on flatter surfaces the start lies below the
-    point."""
+    """1: superior component of a normal (a slope of 60 deg) below which the ray of a point, which
+    starts half-way through the insert, may start in the femur beside the point. Chosen because on
+    flatter surfaces the ray starts below the point."""
     ray_start_depth: float = 1e-6
     """m: depth below the surface at which rays into the insert begin. Chosen because it is above
     the rounding of a mesh."""

@@ -21,8 +21,8 @@ class CondyleSettings:
     with two condyles have notches of 6 to 14 mm."""
     yawed_notch_depth: float = 3e-3
     """m: smallest depth of a notch along any direction that shows two condyles. Chosen because a
-    single condyle of a real component has notches up to 2.4 mm (DM, JW and the shipped knee cut in
-    halves)."""
+    single condyle of a real component has notches up to 2.4 mm (components of the Grand Challenge
+    subjects DM and JW, and of the shipped knee, cut in halves)."""
     extended_notch_depth: float = 0.5e-3
     """m: smallest depth, at 0 deg of flexion, of the notch between two condyles. Chosen because a
     single long body has no notch there, although its ends may resemble condyles in flexion."""

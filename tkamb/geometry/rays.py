@@ -92,11 +92,11 @@ class RayCaster:
         return distance, face
 
     def last_exit(self, origins: ArrayLike, directions: ArrayLike) -> Array:
-        """Return the distance (n,), m, at which each ray finally leaves the body; inf without exit.
+        """Return the distance (n,), m, of the first exit that counts on each ray; inf without exit.
 
         Two kinds of exit do not count: through an inner wall, where the next shell begins at the
         same place, and into a closed void, which has a shell of its own. An exit into an undercut
-        counts.
+        counts, although the ray enters the body again behind it.
 
         Args:
             origins: (n, 3) m.

@@ -17,7 +17,8 @@ class LatticeStart(WarmStart):
 
     Args:
         problem: the problem that was solved. Other problems ignore the warm start.
-        loads: nonlinear loads h + r, N, shape (n, 3); None for a linear material.
+        loads: nonlinear loads h plus the residual r (`nonlinear_balance.py`), N, shape (n, 3), the
+            first h of the next solution; None for a linear material.
         displacement: displacement of the contact nodes, m, shape (c, 3); 0 except at candidates.
         depth: travel of the femoral component since it touched the first contact node, m.
         region: elements outside of which h is zero, or None.

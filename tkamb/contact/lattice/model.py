@@ -182,8 +182,9 @@ class CellContact(ContactModel):
             pose: pose_femoral_in_insert, shape (4, 4).
             start: an earlier result, or its warm start.
             forces_only: whether only the forces are needed. Then only the region of the warm start
-                is evaluated, contact areas count whole nodes, and nothing is flagged. This is
-                accurate near the pose of the warm start (`LatticeProbe`).
+                is evaluated, a contact area is the sum of the tributary areas of the loaded nodes,
+                and nothing is flagged. This is accurate near the pose of the warm start
+                (`LatticeProbe`).
         """
         pose = np.array(pose, float)
         if not np.isfinite(pose).all():

@@ -15,8 +15,9 @@ class LatticeSolverSettings:
     norms over the free unknowns). Smaller: more passes. Larger: fewer passes, nodal forces less
     accurate. Chosen above the rounding residual: if `tolerance` is 1e-3 or more, the factor is
     stored in 16-bit integers. Their rounding leaves a residual of 4e-4 (2 mm) to 1.2e-3 (1 mm) on
-    the shipped knee, which passes on the region cannot remove. Its work is below 1e-5. Passes
-    on the whole solid remove a larger residual (2.6e-3 at 16 kN and 1 mm)."""
+    the shipped knee, which passes on the region cannot remove. The work of this residual is below
+    1e-5. Where it is above the tolerance (2.6e-3 at 16 kN and 1 mm), passes on the whole solid
+    remove it."""
     work_tolerance: float = 3e-4
     """1: largest work of the residual force on the displacement, relative to the work of the
     contact forces, times the softening. It estimates the relative error of the approach (energy

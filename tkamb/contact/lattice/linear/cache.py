@@ -19,7 +19,7 @@ files of killed processes are removed. If the folder then exceeds its limit, the
 files are removed too.
 
 The folder is $TKAMB_CACHE_DIR, else $XDG_CACHE_HOME/tkamb, else ~/.cache/tkamb. Small operators,
-which take about a second, are not stored.
+which take two seconds or less, are not stored.
 """
 
 import fcntl
@@ -67,8 +67,8 @@ class FactorCacheSettings:
     """Bytes: a file with a longer header is rejected. Chosen because a real header has some
     hundreds."""
     least_unknowns: int = 20_000
-    """Unknowns: smaller operators are not stored. Chosen because factorising them is faster than
-    reading."""
+    """Unknowns: smaller operators are not stored. Chosen because factorising them takes two seconds
+    or less."""
     size_limit: float = 6e9
     """Bytes: largest size of the folder. The least recently used files are removed first. Chosen
     because it is a small part of a usual disk."""

@@ -25,7 +25,8 @@ from tkamb.geometry.threads import both, in_halves
 Precision = type[np.floating[Any]]
 
 SINGLE: Precision = np.float32
-"""Precision of a stored operator. A solve reads half as many bytes as in double precision."""
+"""Precision of a stored operator, unless its factor is stored in 16-bit integers. A solve reads
+half as many bytes as in double precision."""
 
 
 @dataclass(frozen=True)

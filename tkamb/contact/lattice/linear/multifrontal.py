@@ -180,7 +180,8 @@ class CholeskyFactor:
         starts: first unknown of each front in elimination order, children before parents, then
             the number of unknowns, shape (f + 1,).
         parents: front above each front, shape (f,); -1 at a root.
-        edges: position in `boundary` of each front's boundary, then its length, shape (f + 1,).
+        edges: position in `boundary` at which the boundary of each front begins, then the length
+            of `boundary`, shape (f + 1,).
         boundary: later unknowns that the fronts are coupled with, increasing within a front,
             shape (b,).
         values: rows of W without the zeros of L11⁻¹, each divided by its scale.

@@ -143,8 +143,8 @@ def factor_memory(
             MEMORY_NEED.unknowns_per_node * len(own),
             MEMORY_NEED.unknowns_per_node * len(boundary),
         )
-        # In memory are W in 8 bytes and as stored, the update (m, m), and the updates that wait
-        # for their parents.
+        # In memory are the stored W of all fronts so far and, with 8 bytes for a number, W and the
+        # update (m, m) of this front, and the updates that wait for their parents.
         block = float(k + m) * k
         stored += block
         peak = max(peak, itemsize * stored + 8.0 * (live + block + float(m) * m))

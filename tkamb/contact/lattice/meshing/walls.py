@@ -28,8 +28,8 @@ class NotchSettings:
     """1: a node is moved towards the line between its neighbours, except for this share of the way.
     Chosen because on the line the cell's corner would be flat."""
     corner_inset: float = 1e-3
-    """1: distance of a node from its corner, relative to the distance of the node across the
-    diagonal. Chosen because vertical rays then meet the part."""
+    """1: a node is moved to the corner of the part, and from there inwards by this share of the way
+    to the node across the diagonal. Chosen because vertical rays then meet the part."""
     ray_start_cells: float = 0.1
     """Cells: distance below the top, or above the bottom, of points that are tested for being
     inside the part. Chosen above the rounding of a mesh and within the cell."""
