@@ -18,7 +18,6 @@ from tkamb.geometry.frames import (
     PATELLA_JOINT_NAMES,
     Array,
     inverse,
-    rotate,
     transform,
 )
 from tkamb.knee.load import PointForces, wrenches
@@ -260,22 +259,6 @@ class ChainState:
             wrench: force (N) and moment about the insert's origin (N·m), insert frame, shape (6,).
         """
         self.inertial = self.inertial + self._jacobian(link).T @ wrench
-
-    def ground_reaction(self, force: Array, point: Array, moment: Array) -> PointForces:
-        """Return the ground reaction as a load on the tibia.
-
-        Args:
-            force: force, laboratory axes, shape (3,), N.
-            point: point of application, laboratory frame, shape (3,), m.
-            moment: free moment, laboratory axes, shape (3,), N·m.
-        """
-        laboratory = self.laboratory_in_insert
-        return PointForces(
-            "tibia",
-            transform(laboratory, point)[None],
-            rotate(laboratory, force)[None],
-            rotate(laboratory, moment),
-        )
 
     def _jacobian(self, link: str) -> Array:
         """Return a link's Jacobian (6, nv) at the insert's origin, in the insert's axes."""
