@@ -69,9 +69,9 @@ def test_a_total_that_depends_on_the_adjustment_is_flagged(tmp_path):
     change = adjusted["force_total_BW"] - recorded["force_total_BW"]
     np.testing.assert_allclose(adjusted["adjust_force_change_BW"], change, rtol=1e-9)
     assert (np.abs(change) > 0.01).any()
-    for status, one in zip(adjusted.status, change, strict=True):
+    for status, frame_change in zip(adjusted.status, change, strict=True):
         flagged = "femoral adjustment changes the total" in status
-        assert flagged == (abs(one) > 0.01)
+        assert flagged == (abs(frame_change) > 0.01)
 
 
 def test_a_restored_frame_has_its_contact_points_at_the_recorded_rotation(tmp_path):

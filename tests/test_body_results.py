@@ -35,7 +35,7 @@ def test_slip_velocity_by_arcs_is_that_of_the_rigid_body(bend, side):
 
 @pytest.mark.parametrize("side", ["medial", "lateral"])
 def test_the_shipped_motion_satisfies_the_contact_constraint(bend, side):
-    """Its poses are first touches of smooth surfaces. The facets cause up to 0.1 mm/s."""
+    """The poses are first touches of smooth surfaces. The facets of the meshes cause 0.1 mm/s."""
     assert np.abs(bend[f"{side}_normal_velocity_mm_per_s"]).max() < 0.1
 
 

@@ -97,7 +97,7 @@ def test_a_singular_frame_fails_and_the_other_frames_do_not(tmp_path):
 
 
 def test_a_quadriceps_through_the_patellofemoral_contact_makes_the_equations_singular():
-    """It cannot balance the patellar ligament at any tension."""
+    """Such a quadriceps cannot balance the patellar ligament."""
     geometry = shipped_frame().geometry
     quadriceps = geometry.muscles[0].loads
     (on_patella,) = (load for load in quadriceps if load.link == "patella")

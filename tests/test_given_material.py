@@ -30,8 +30,8 @@ def test_each_law_follows_its_formula():
         {"young_modulus_MPa": 800, "poisson_ratio": 0.4, "law": "ramberg-osgood", **numbers}
     )
     stress = bent.stress(strain)
-    again = stress / 800e6 + 0.05 * np.abs(stress / 9e6) ** 3 * stress / 800e6
-    assert again == pytest.approx(strain, abs=1e-12)
+    total_strain = stress / 800e6 + 0.05 * np.abs(stress / 9e6) ** 3 * stress / 800e6
+    assert total_strain == pytest.approx(strain, abs=1e-12)
     table = given_material({"poisson_ratio": 0.4, "law": "tabulated", **CURVE})
     assert table.stress(CURVE["strain"]) / 1e6 == pytest.approx(CURVE["stress_MPa"])
     doubled = {"poisson_ratio": 0.4, "law": "tabulated", **CURVE}
@@ -85,25 +85,25 @@ def test_press_accepts_a_file_a_name_or_a_material_and_reports_it(soft, capsys):
     command = ["press", str(FEMORAL), str(INSERT), "--load", "1500", "--pose"]
     command += [*map(str, POSE), "--contact", "foundation-linear", "--resolution", "3", "--json"]
     assert main([*command, "--material", str(soft)]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["material"]["young_modulus_MPa"] == 300.0
-    assert found["material"]["sources"] == ["measured here"]
-    assert found["known_error"] == "not measured"
-    given = {"pose": POSE, "contact": "foundation-linear", "resolution_mm": 3.0}
-    again = press_meshes(FEMORAL, INSERT, 1500.0, material=named_material(soft), **given)
-    assert again.result.approach * 1e3 == pytest.approx(found["approach_mm"])
+    output = json.loads(capsys.readouterr().out)
+    assert output["material"]["young_modulus_MPa"] == 300.0
+    assert output["material"]["sources"] == ["measured here"]
+    assert output["known_error"] == "not measured"
+    options = {"pose": POSE, "contact": "foundation-linear", "resolution_mm": 3.0}
+    reference = press_meshes(FEMORAL, INSERT, 1500.0, material=named_material(soft), **options)
+    assert reference.result.approach * 1e3 == pytest.approx(output["approach_mm"])
     # the pressure is E over h times the depth: load and E in the same ratio give the same depth
     half = press_meshes(
-        FEMORAL, INSERT, 1500.0 * 561.5 / 300.0, material="polyethylene-linear", **given
+        FEMORAL, INSERT, 1500.0 * 561.5 / 300.0, material="polyethylene-linear", **options
     )
-    assert half.result.approach == pytest.approx(again.result.approach, rel=1e-3)
+    assert half.result.approach == pytest.approx(reference.result.approach, rel=1e-3)
     assert main([*command, "--material", "soft.tml"]) == 2
     assert "no material 'soft.tml'" in capsys.readouterr().err
 
 
 def test_contact_summary_and_wear_use_the_scene_s_material(tmp_path):
-    own = {"young_modulus_MPa": 300.0, "poisson_ratio": 0.45, "yield_stress_MPa": 12.0}
-    changes = {f"material__{key}": value for key, value in own.items()}
+    scene_values = {"young_modulus_MPa": 300.0, "poisson_ratio": 0.45, "yield_stress_MPa": 12.0}
+    changes = {f"material__{key}": value for key, value in scene_values.items()}
     path = write_scene(
         tmp_path,
         contact__material=None,
@@ -152,23 +152,23 @@ def test_materials_change_the_identity_of_a_run_and_wear_keys_do_not(tmp_path):
         write_scene(tmp_path / "c", contact__material=None, material__base="polyethylene-linear")
     )
     texts = [
-        one.identity_json.replace(str(tmp_path / name), "")
-        for one, name in ((plain, "a"), (worn, "b"), (other, "c"))
+        loaded.identity_json.replace(str(tmp_path / name), "")
+        for loaded, name in ((plain, "a"), (worn, "b"), (other, "c"))
     ]
     assert texts[0] == texts[1] != texts[2]
 
 
-def test_an_override_of_the_material_replaces_what_the_scene_gives():
-    scene = MODEL / "scene.toml"  # names [contact] material and [output] yield_stress_MPa
-    own = load_scene(scene, {"material.base": "polyethylene", "material.yield_stress_MPa": 25.0})
-    assert own.material is not None and own.material.yield_stress_MPa == 25.0
-    whole = load_scene(scene, {"material": {"base": "polyethylene", "young_modulus_MPa": 900.0}})
-    assert given_material(whole.insert_material).young_modulus == pytest.approx(900e6)
+def test_an_override_of_the_material_replaces_the_material_of_the_scene():
+    path = MODEL / "scene.toml"  # names [contact] material and [output] yield_stress_MPa
+    scene = load_scene(path, {"material.base": "polyethylene", "material.yield_stress_MPa": 25.0})
+    assert scene.material is not None and scene.material.yield_stress_MPa == 25.0
+    scene = load_scene(path, {"material": {"base": "polyethylene", "young_modulus_MPa": 900.0}})
+    assert given_material(scene.insert_material).young_modulus == pytest.approx(900e6)
     with pytest.raises(InputError, match="two materials"):
-        load_scene(scene, {"material.base": "polyethylene", "contact.material": "polyethylene"})
+        load_scene(path, {"material.base": "polyethylene", "contact.material": "polyethylene"})
 
 
 def test_an_override_by_a_built_in_name_replaces_the_scene_s_own_material(tmp_path):
-    own = write_scene(tmp_path, contact__material=None, material__base="polyethylene")
-    named = load_scene(own, {"contact.material": "polyethylene-linear"})
+    path = write_scene(tmp_path, contact__material=None, material__base="polyethylene")
+    named = load_scene(path, {"contact.material": "polyethylene-linear"})
     assert named.material is None and named.contact.material == "polyethylene-linear"
