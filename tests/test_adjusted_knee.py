@@ -25,6 +25,7 @@ def wrong_scene(folder, degrees, raised_mm):
 
 
 def with_and_without(path):
+    """Yield the results with the adjustment, then those without."""
     return (
         simulate(load_scene(path, {"contact.adjust": adjust, "motion.frames": 26}), frames=FRAMES)
         for adjust in (True, False)
@@ -32,6 +33,7 @@ def with_and_without(path):
 
 
 def split(results):
+    """Return the medial share of the condylar forces by deformation."""
     return results["medial_force_N"] / (results["medial_force_N"] + results["lateral_force_N"])
 
 

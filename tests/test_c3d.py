@@ -45,7 +45,7 @@ def plate_signals(kind: int, corners: np.ndarray, origin: np.ndarray) -> np.ndar
     about = m + np.cross(origin if kind != 3 else [0, 0, origin[2]], f)
     if kind != 3:
         return np.column_stack([f, about * 1e3]).T
-    # any distribution over the eight sensors with this force and moment
+    # one of many distributions over the eight sensors with this force and moment
     fx = [f[:, 0] / 2, f[:, 0] / 2]
     fy = [f[:, 1] / 2 + about[:, 2] / (2 * A), f[:, 1] / 2 - about[:, 2] / (2 * A)]
     roll, pitch = about[:, 0] / (4 * B), about[:, 1] / (4 * A)
@@ -54,7 +54,7 @@ def plate_signals(kind: int, corners: np.ndarray, origin: np.ndarray) -> np.ndar
     return np.array([*fx, *fy, *fz, quarter - roll - pitch])
 
 
-FLIPPED = AMTI_CORNERS[[1, 0, 3, 2]]  # x and z of the plate turned: its z points down
+FLIPPED = AMTI_CORNERS[[1, 0, 3, 2]]  # x and z are reversed, so that z points down
 
 
 @pytest.mark.parametrize("corners", [AMTI_CORNERS, FLIPPED], ids=["up", "down"])
@@ -211,6 +211,7 @@ def test_labels_match_independent_of_prefix_and_dots():
 
 
 def written(tmp_path: Path, **changes) -> Path:
+    """Write a recording of one plate under `pushes`, with changed arguments of `write_c3d`."""
     signals = plate_signals(2, AMTI_CORNERS, np.zeros(3))
     plate = {"type": 2, "channels": list(range(1, 7))} | changes.pop("plate", {})
     arguments = {
@@ -221,27 +222,31 @@ def written(tmp_path: Path, **changes) -> Path:
     return write_c3d(tmp_path / "bad.c3d", standing_markers(COUNT), **arguments)
 
 
-def cut(path: Path, share: float) -> Path:
+def truncated(path: Path, share: float) -> Path:
+    """Shorten a file to a share of its length, and return its path."""
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
     return path
 
 
-def stating(path: Path, analog_rate: float) -> Path:
-    """Change ANALOG:RATE, the second RATE in the file."""
+def with_analog_rate(path: Path, analog_rate: float) -> Path:
+    """Change ANALOG:RATE, the second RATE in the file, and return the path."""
     content = bytearray(path.read_bytes())
-    at = content.index(b"RATE", content.index(b"RATE") + 4) + 8
-    content[at : at + 4] = struct.pack("<f", analog_rate)
+    offset = content.index(b"RATE", content.index(b"RATE") + 4) + 8
+    content[offset : offset + 4] = struct.pack("<f", analog_rate)
     path.write_bytes(content)
     return path
 
 
 REFUSED = {
-    "analog rate no multiple": (lambda d: stating(written(d), 1050.0), "no multiple"),
-    "analog rate of other samples": (lambda d: stating(written(d), 2000.0), "10 samples a frame"),
-    "analog rate below the markers'": (lambda d: stating(written(d), 50.0), "no multiple"),
-    "half of the file": (lambda d: cut(written(d), 0.5), "cut short"),
-    "no parameters": (lambda d: cut(written(d), 0.02), "C3D"),
+    "analog rate no multiple": (lambda d: with_analog_rate(written(d), 1050.0), "no multiple"),
+    "analog rate of other samples": (
+        lambda d: with_analog_rate(written(d), 2000.0),
+        "10 samples a frame",
+    ),
+    "analog rate below the markers'": (lambda d: with_analog_rate(written(d), 50.0), "no multiple"),
+    "half of the file": (lambda d: truncated(written(d), 0.5), "cut short"),
+    "no parameters": (lambda d: truncated(written(d), 0.02), "C3D"),
     "text": (lambda d: text(d, "not a recording at all" * 100), "not a C3D file"),
     "empty": (lambda d: text(d, ""), "not a C3D file"),
     "not there": (lambda d: d / "none.c3d", "no such file"),

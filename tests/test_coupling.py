@@ -37,6 +37,7 @@ def tilting():
 
 
 def shares(results):
+    """Return the medial share by deformation, and that by coronal equilibrium."""
     medial, lateral = results["medial_force_N"], results["lateral_force_N"]
     return medial / (medial + lateral), results["medial_share_equilibrium"]
 

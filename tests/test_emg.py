@@ -83,6 +83,7 @@ def table(file, **changes):
 
 
 def burst(centre):
+    """Return a signal at 97.3 Hz with a maximum of its amplitude at a time, s."""
     return np.exp(-(((TIME - centre) / 0.2) ** 2)) * np.sin(2 * np.pi * 97.3 * TIME)
 
 

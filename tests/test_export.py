@@ -21,6 +21,7 @@ def folder(tmp_path_factory):
 
 
 def exported(folder, tmp_path):
+    """Return the path of the storage file of a results folder."""
     path = tmp_path / "run.sto"
     assert main(["export", str(folder), "--sto", str(path)]) == 0
     return path

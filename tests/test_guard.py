@@ -92,6 +92,7 @@ def test_an_interrupt_during_the_imports_is_one_line(monkeypatch, capsys):
 
 
 def refused(capfd, *arguments):
+    """Return the message of a command that must end with status 2 and one line."""
     assert main([str(argument) for argument in arguments]) == 2
     output = capfd.readouterr().err
     assert output.count("\n") == 1 and output.startswith("tkamb: ")

@@ -203,7 +203,7 @@ def test_an_unlikely_input_is_flagged_in_its_frames(knee, name):
     outcome = knee.outcome(edit)
     assert not outcome.refused
     assert any(re.search(words, word) for word in outcome.words), outcome.words
-    if name not in ("one sample", "lean's sign"):  # of frames before and after
+    if name not in ("one sample", "lean's sign"):  # these do not affect all frames
         assert {word.partition(":")[0] for word in outcome.words} >= {"0", "2", "4"}
 
 
@@ -213,6 +213,7 @@ def test_the_shipped_knee_raises_no_question(knee):
 
 
 def assert_none_passes(bench, rng, counts):
+    """Assert that random mistakes are noticed or leave all forces unchanged."""
     silent = []
     for name, edit in random_mistakes(bench, rng, *counts):
         outcome = bench.outcome(edit)

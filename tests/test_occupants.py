@@ -25,6 +25,7 @@ COMMANDS = {
 
 
 def content(folder):
+    """Return name -> bytes of all files below a folder."""
     return {path.name: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 

@@ -90,6 +90,7 @@ def meshes(tmp_path_factory):
 
 
 def condyles(report):
+    """Return the results of medial and lateral condyle, one row each (2, 7)."""
     output = report.as_dict()
     return np.array(
         [[*(output[s][k] for k in CONDYLE_KEYS[:-1]), *output[s]["cop_mm"]] for s in SIDES]

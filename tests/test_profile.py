@@ -8,6 +8,7 @@ from tkamb.run.timing import Profile
 
 
 def profiled(folder, drop, capsys, *options):
+    """Return the profile of a run of the shipped scene without the tables in `drop`."""
     scene = write_scene(folder / "scene", drop)
     out = folder / "out"
     run = ["run", str(scene), "--out", str(out), "--frames", "0:101:50", "--profile", "--json"]

@@ -29,6 +29,7 @@ TOTAL = 20
 
 
 def start(scene, out, *more):
+    """Start a run of 20 frames in another process."""
     command = [sys.executable, "-m", "tkamb.cli", "run", str(scene), "--out", str(out)]
     command += [*more, *FRAMES]
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
@@ -61,7 +62,7 @@ def check_complete(out):
         assert np.isnan(results["force_si_N"][np.invert(computed)]).all()
 
 
-def check_same(results: Results, undisturbed: Results, tolerance=0.0):
+def check_equal(results: Results, undisturbed: Results, tolerance=0.0):
     assert results.status == undisturbed.status
     assert list(results.columns) == list(undisturbed.columns)
     for name in results.columns:
@@ -104,7 +105,7 @@ def test_a_run_that_is_killed_repeatedly_has_the_results_of_an_undisturbed_run(
     """The kills are at the start, at the first frames, in between and at the end."""
     waits = [(0, 0.5), (1, 0.0), (3, 0.01), (8, 0.03), (14, 0.0), (TOTAL, 0.02)]
     results = kill_and_resume(tmp_path / "out", waits)
-    check_same(results, undisturbed)
+    check_equal(results, undisturbed)
     assert results.summary["resumed_frames"] >= 14
 
 
@@ -112,7 +113,7 @@ def test_a_run_that_is_killed_repeatedly_has_the_results_of_an_undisturbed_run(
 def test_a_run_killed_at_random_times_has_the_results_of_an_undisturbed_run(tmp_path, undisturbed):
     chance = random.Random(7)
     moments = [(chance.randrange(1, TOTAL + 1), chance.random() ** 2) for _ in range(20)]
-    check_same(kill_and_resume(tmp_path / "out", sorted(moments)), undisturbed)
+    check_equal(kill_and_resume(tmp_path / "out", sorted(moments)), undisturbed)
 
 
 @pytest.mark.parametrize(
@@ -135,7 +136,7 @@ def test_a_resumed_run_with_released_coordinates_has_the_same_results(tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     stop_after(out, 3, scene=scene, **options)
-    check_same(simulate(scene, directory=out, resume=True, **options), reference, tolerance=1e-6)
+    check_equal(simulate(scene, directory=out, resume=True, **options), reference, tolerance=1e-6)
 
 
 def stop_after(directory, count, scene=None, **options):
@@ -176,7 +177,7 @@ def test_a_run_without_contact_is_resumed(tmp_path):
     stop_after(out, 3, scene=scene, frames=slice(0, 8))
     assert not (out / "contact.h5").exists()
     results = simulate(scene, frames=slice(0, 8), directory=out, resume=True)
-    check_same(results, simulate(scene, frames=slice(0, 8)))
+    check_equal(results, simulate(scene, frames=slice(0, 8)))
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ def serial():
 
 
 def numbers(results):
+    """Return name -> values of the numeric columns."""
     return {name: results[name] for name in results.columns if KINDS.get(name) != "text"}
 
 

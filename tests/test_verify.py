@@ -30,6 +30,7 @@ def run(finished, tmp_path):
 
 
 def verified(out, capfd):
+    """Return exit status and output of `tkamb verify`."""
     capfd.readouterr()
     status = main(["verify", str(out)])
     output = capfd.readouterr()
@@ -43,7 +44,7 @@ def test_unchanged_results_are_verified(run, capfd):
     assert verified(run[1], capfd)[0] == 0
 
 
-def swap_cell(out):
+def change_cell(out):
     path = out / "results.csv"
     header, first, *other_lines = path.read_text().splitlines()
     cells = first.split(",")
@@ -51,7 +52,8 @@ def swap_cell(out):
     path.write_text("\n".join([header, ",".join(cells), *other_lines]) + "\n")
 
 
-def flip_map(out):
+def change_map(out):
+    """Invert one bit of contact.h5."""
     path = out / "contact.h5"
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 4
@@ -65,8 +67,8 @@ def change_summary(out):
 
 
 CHANGES = [
-    (swap_cell, "results.csv has changed"),
-    (flip_map, "contact.h5 has changed"),
+    (change_cell, "results.csv has changed"),
+    (change_map, "contact.h5 has changed"),
     (change_summary, "summary.json has changed"),
     (lambda out: (out / "contact.h5").unlink(), "contact.h5 is missing"),
 ]
