@@ -49,7 +49,7 @@ def test_the_adjustment_leaves_the_shipped_total_alone(tmp_path):
 @pytest.mark.parametrize("degrees", [0.35, pytest.param(-0.35, marks=pytest.mark.slow)])
 def test_the_adjustment_corrects_the_split_of_a_coronal_error(tmp_path, degrees):
     """With errors of 0.35 deg and 0.3 mm the total changes by 0.006 BW."""
-    right = next(with_and_without(wrong_scene(tmp_path / "right", 0.0, 0.0)))
+    reference = next(with_and_without(wrong_scene(tmp_path / "right", 0.0, 0.0)))
     adjusted, recorded = with_and_without(wrong_scene(tmp_path / "wrong", degrees, 0.3))
     change = adjusted["force_total_BW"] - recorded["force_total_BW"]
     assert 1e-6 < np.abs(change).max() < 0.01
@@ -60,7 +60,7 @@ def test_the_adjustment_corrects_the_split_of_a_coronal_error(tmp_path, degrees)
     assert any("contradicts" in status for status in recorded.status)
     assert (np.abs(adjusted["adjust_coronal_deg"]) > 0.3).all()
     np.testing.assert_array_equal(adjusted["adjust_restored"], 0)
-    error = [np.abs(split(results) - split(right)).max() for results in (adjusted, recorded)]
+    error = [np.abs(split(results) - split(reference)).max() for results in (adjusted, recorded)]
     assert error[0] < 0.2 * error[1]
 
 

@@ -77,8 +77,8 @@ def test_the_deck_states_frame_model_approach_and_load(folder, pressed, tmp_path
 def test_the_febio_deck_has_the_same_bodies_and_the_approach(pressed):
     root = ElementTree.fromstring(pressed.deck("feb"))
     assert root.get("version") == "4.0"
-    places = [element.text.split(",") for element in root.findall("Mesh/Nodes/node")]
-    nodes = np.array(places, float) * 1e-3
+    texts = [element.text.split(",") for element in root.findall("Mesh/Nodes/node")]
+    nodes = np.array(texts, float) * 1e-3
     lattice, patch = pressed.problem.lattice, pressed.problem.patch
     count = len(lattice.nodes)
     np.testing.assert_allclose(nodes[:count], lattice.nodes, atol=1e-10)
@@ -86,14 +86,16 @@ def test_the_febio_deck_has_the_same_bodies_and_the_approach(pressed):
         element.text.split(",") for element in root.findall("Mesh/Elements[@name='insert']/elem")
     ]
     np.testing.assert_array_equal(np.array(cells, int) - 1, lattice.cells)
-    lifted = nodes[count:] - patch.vertices
-    np.testing.assert_allclose(lifted, [[0, pressed.problem.depth, 0]] * len(lifted), atol=1e-10)
+    displacement = nodes[count:] - patch.vertices
+    np.testing.assert_allclose(
+        displacement, [[0, pressed.problem.depth, 0]] * len(displacement), atol=1e-10
+    )
     (travel,) = root.findall("Rigid/rigid_bc[@type='rigid_displacement']/value")
     assert float(travel.text) == pytest.approx(-pressed.approach * 1e3)
     quads = contact_quads(lattice)
     a, b, c, d = (lattice.nodes[quads[:, k]] for k in range(4))
-    up = np.cross(c - a, d - b)[:, 1]
-    assert len(quads) > 50 and (up > 0).all()  # outward of the articular surface is upward
+    vertical = np.cross(c - a, d - b)[:, 1]
+    assert len(quads) > 50 and (vertical > 0).all()  # outward of the articular surface is upward
     assert set(np.unique(lattice.contact_triangles)) == set(np.unique(quads))
 
 

@@ -96,8 +96,8 @@ def test_a_run_survives_any_fault(tmp_path, monkeypatch, capfd, quick_case):
         states.add(state)
         if number % 9:  # the rest takes a whole run
             continue
-        more = ["--resume"] if state == "new" else []
-        assert main([*second, *more]) == 0, (faults.calls[number], capfd.readouterr().err)
+        options = ["--resume"] if state == "new" else []
+        assert main([*second, *options]) == 0, (faults.calls[number], capfd.readouterr().err)
         assert np.array_equal(read_results(out).columns["hip_force_si_N"], expected)
         assert {p.name for p in out.iterdir() if p.name.startswith(".")} == {".tkamb"}
     else:

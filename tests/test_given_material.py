@@ -26,17 +26,17 @@ def test_each_law_follows_its_formula():
     assert isinstance(linear.law, LinearElastic)
     assert linear.stress(strain) == pytest.approx(800e6 * strain)
     numbers = {"alpha": 0.05, "reference_stress_MPa": 9.0, "exponent": 4.0}
-    bent = given_material(
+    ramberg_osgood = given_material(
         {"young_modulus_MPa": 800, "poisson_ratio": 0.4, "law": "ramberg-osgood", **numbers}
     )
-    stress = bent.stress(strain)
+    stress = ramberg_osgood.stress(strain)
     total_strain = stress / 800e6 + 0.05 * np.abs(stress / 9e6) ** 3 * stress / 800e6
     assert total_strain == pytest.approx(strain, abs=1e-12)
     table = given_material({"poisson_ratio": 0.4, "law": "tabulated", **CURVE})
     assert table.stress(CURVE["strain"]) / 1e6 == pytest.approx(CURVE["stress_MPa"])
-    doubled = {"poisson_ratio": 0.4, "law": "tabulated", **CURVE}
-    doubled["young_modulus_MPa"] = 2 * table.young_modulus / 1e6
-    assert given_material(doubled).stress(strain) == pytest.approx(2 * table.stress(strain))
+    scaled_curve = {"poisson_ratio": 0.4, "law": "tabulated", **CURVE}
+    scaled_curve["young_modulus_MPa"] = 2 * table.young_modulus / 1e6
+    assert given_material(scaled_curve).stress(strain) == pytest.approx(2 * table.stress(strain))
 
 
 def test_a_base_gives_the_missing_values_and_the_sources():
@@ -46,8 +46,8 @@ def test_a_base_gives_the_missing_values_and_the_sources():
     assert (stiffer.young_modulus, stiffer.poisson_ratio) == (900e6, base.poisson_ratio)
     assert stiffer.law == base.law and stiffer.name == "polyethylene (changed)"
     assert any("Halloran" in source for source in stiffer.sources)
-    straight = given_material({"base": "polyethylene", "law": "linear"})
-    assert isinstance(straight.law, LinearElastic)
+    linear = given_material({"base": "polyethylene", "law": "linear"})
+    assert isinstance(linear.law, LinearElastic)
     record = material_as_json(stiffer)
     assert (record["young_modulus_MPa"], record["law"]) == (900.0, "ramberg-osgood")
 
@@ -93,10 +93,10 @@ def test_press_accepts_a_file_a_name_or_a_material_and_reports_it(soft, capsys):
     reference = press_meshes(FEMORAL, INSERT, 1500.0, material=named_material(soft), **options)
     assert reference.result.approach * 1e3 == pytest.approx(output["approach_mm"])
     # the pressure is E over h times the depth: load and E in the same ratio give the same depth
-    half = press_meshes(
+    scaled_load = press_meshes(
         FEMORAL, INSERT, 1500.0 * 561.5 / 300.0, material="polyethylene-linear", **options
     )
-    assert half.result.approach == pytest.approx(reference.result.approach, rel=1e-3)
+    assert scaled_load.result.approach == pytest.approx(reference.result.approach, rel=1e-3)
     assert main([*command, "--material", "soft.tml"]) == 2
     assert "no material 'soft.tml'" in capsys.readouterr().err
 
@@ -147,13 +147,13 @@ def test_contradicting_declarations_are_refused(tmp_path, changes, words):
 
 def test_materials_change_the_identity_of_a_run_and_wear_keys_do_not(tmp_path):
     plain = load_scene(write_scene(tmp_path / "a"))
-    worn = load_scene(write_scene(tmp_path / "b", wear__close="as recorded"))
+    with_wear = load_scene(write_scene(tmp_path / "b", wear__close="as recorded"))
     other = load_scene(
         write_scene(tmp_path / "c", contact__material=None, material__base="polyethylene-linear")
     )
     texts = [
         loaded.identity_json.replace(str(tmp_path / name), "")
-        for loaded, name in ((plain, "a"), (worn, "b"), (other, "c"))
+        for loaded, name in ((plain, "a"), (with_wear, "b"), (other, "c"))
     ]
     assert texts[0] == texts[1] != texts[2]
 

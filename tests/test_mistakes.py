@@ -214,13 +214,13 @@ def test_the_shipped_knee_raises_no_question(knee):
 
 def assert_none_passes(bench, rng, counts):
     """Assert that random mistakes are noticed or leave all forces unchanged."""
-    silent = []
+    silent_mistakes = []
     for name, edit in random_mistakes(bench, rng, *counts):
         outcome = bench.outcome(edit)
         assert "\n" not in outcome.refused
         if not outcome.notices(bench.untouched) and not outcome.same(bench.untouched):
-            silent.append(name)
-    assert not silent
+            silent_mistakes.append(name)
+    assert not silent_mistakes
 
 
 def test_no_random_mistake_is_silent(knee):

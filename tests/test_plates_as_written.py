@@ -72,13 +72,13 @@ def test_a_unit_word_has_its_factor_to_si(word, read, value):
     assert read(word) == (None if value is None else pytest.approx(value))
 
 
-@pytest.mark.parametrize("given", ["moment", "both"])
-def test_an_unknown_unit_word_needs_the_option_of_the_unit(tmp_path, given):
-    force = "N" if given == "moment" else "kiloponds?"
+@pytest.mark.parametrize("option", ["moment", "both"])
+def test_an_unknown_unit_word_needs_the_option_of_the_unit(tmp_path, option):
+    force = "N" if option == "moment" else "kiloponds?"
     path = recorded(tmp_path, units=[force] * 3 + ["huh"] * 3)
     with pytest.raises(InputError, match=r"'(huh|kiloponds\?)'.*--(force|moment)-unit"):
         read_c3d(path).plate(1)
-    units = GivenUnits(force="N" if given == "both" else None, moment="Nmm")
+    units = GivenUnits(force="N" if option == "both" else None, moment="Nmm")
     np.testing.assert_allclose(read_c3d(path, units).plates[0].wrench, wrench(), atol=1e-3)
     with pytest.raises(InputError, match="correct moment_unit"):
         read_c3d(recorded(tmp_path), GivenUnits(moment="Nm")).plate(1)
@@ -178,8 +178,8 @@ def with_zero(path, zero):
 def two_plates(folder, level):
     """Write two drifting plates, with a foot on plate 1 from frame 6."""
     clean, _ = offset_signals()
-    beside = np.zeros_like(clean)
-    signals = np.concatenate([clean, beside])
+    unloaded = np.zeros_like(clean)
+    signals = np.concatenate([clean, unloaded])
     signals[[2, 8]] += level
     distant_corners = AMTI_CORNERS + np.array([1.5, 0.0, 0.0])
     plates = [

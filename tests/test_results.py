@@ -45,9 +45,11 @@ def test_written_and_read_results_are_identical(tmp_path):
 
 def test_columns_have_the_order_of_the_table():
     run = make_run(frames=5, maps=False)
-    fixed = [column.name for column in COLUMNS if "<" not in column.name and not column.optional]
+    names_in_table = [
+        column.name for column in COLUMNS if "<" not in column.name and not column.optional
+    ]
     written = [name for name in run.columns if not is_ligament(name)]
-    assert written == fixed
+    assert written == names_in_table
     ligaments = [name for name in run.columns if is_ligament(name)]
     assert [ligament_of(name) for name in ligaments] == ["PCL_anterolateral", "MCL_anterior"]
     names = list(run.columns)
@@ -63,8 +65,8 @@ def test_a_column_that_is_not_modelled_is_empty():
     assert row["force_total_N"] == ""
     assert row["flexion_deg"] == "60.0"
     assert row["status"] == "singular"
-    absent = sum("<" in column.name or column.optional for column in COLUMNS)
-    assert len(first.split(",")) == len(COLUMNS) - absent
+    absent_count = sum("<" in column.name or column.optional for column in COLUMNS)
+    assert len(first.split(",")) == len(COLUMNS) - absent_count
 
 
 def test_a_column_of_an_earlier_release_is_read_under_its_new_name(tmp_path):
