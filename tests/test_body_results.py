@@ -22,6 +22,7 @@ FRAMES = slice(10, 91, 40)
 
 @pytest.fixture(scope="module")
 def bend():
+    """Return the results of three frames of the shipped bend."""
     return simulate(fast_scene(), frames=FRAMES)
 
 

@@ -280,6 +280,7 @@ REFUSED = {
 
 
 def text(folder: Path, content: str) -> Path:
+    """Write a text into a file with the suffix of a recording."""
     path = folder / "text.c3d"
     path.write_text(content)
     return path

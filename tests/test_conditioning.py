@@ -23,11 +23,13 @@ MIDDLE = 60
 
 @cache
 def mechanics(friction: float = 0.05) -> Mechanics:
+    """Return the equations of the shipped bend."""
     return mechanics_of(load_case(load_scene(MODEL / "scene.toml", {"contact.friction": friction})))
 
 
 @cache
 def shipped_frame() -> FrameLoads:
+    """Return the solved middle frame of the shipped bend."""
     return mechanics().frame(MIDDLE)
 
 

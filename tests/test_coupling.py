@@ -17,6 +17,7 @@ COARSE = {"contact.resolution_mm": 2.0}
 
 
 def run(**contact):
+    """Return the results of six frames with changed keys of [contact]."""
     overrides = COARSE | {f"contact.{key}": value for key, value in contact.items()}
     return simulate(load_scene(SCENE, overrides), frames=FRAMES)
 
@@ -33,6 +34,7 @@ def coupled():
 
 @pytest.fixture(scope="module")
 def tilting():
+    """Return the results with released adduction."""
     return run(released=["adduction"])
 
 

@@ -37,6 +37,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def pressed(folder):
+    """Return the contact problem and the result of the frame."""
     return frame_press(folder, 0)
 
 

@@ -78,6 +78,7 @@ def test_signals_without_an_envelope_are_refused(signal, cutoff, words):
 
 
 def table(file, **changes):
+    """Return [muscles.emg] of a file with changed keys."""
     keys = {"channels": {"VL": ("vaslat",)}, "high_pass_Hz": 20.0, "cutoff_Hz": 6.0}
     return EmgTable(**({"file": file} | keys | changes))
 

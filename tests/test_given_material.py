@@ -75,6 +75,7 @@ def test_an_impossible_material_is_refused(table, words):
 
 @pytest.fixture(scope="module")
 def soft(tmp_path_factory):
+    """Return the path of a material file."""
     path = tmp_path_factory.mktemp("material") / "soft.toml"
     text = 'young_modulus_MPa = 300.0\npoisson_ratio = 0.45\nsources = ["measured here"]\n'
     path.write_text(text, encoding="utf-8")

@@ -26,11 +26,13 @@ def cached_meshes():
 
 @pytest.fixture(scope="module")
 def knee(cached_meshes, tmp_path_factory):
+    """Return the bench of the shipped knee."""
     return shipped_bench(tmp_path_factory.mktemp("knee"))
 
 
 @pytest.fixture(scope="module")
 def dm(cached_meshes, tmp_path_factory):
+    """Return the bench of subject DM."""
     return dm_bench(tmp_path_factory.mktemp("dm"))
 
 

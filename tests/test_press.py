@@ -59,6 +59,7 @@ def two_condyles():
 
 
 def dishes():
+    """Return an insert with two dishes."""
     return dished_insert(
         lambda x, z: 8e-3 + (x**2) / (2 * 50e-3) + (np.abs(z) - 22e-3) ** 2 / (2 * 60e-3),
         half_x=20e-3,

@@ -63,6 +63,7 @@ def check_complete(out):
 
 
 def check_equal(results: Results, undisturbed: Results, tolerance=0.0):
+    """Assert that two results have equal statuses, columns and pressure maps."""
     assert results.status == undisturbed.status
     assert list(results.columns) == list(undisturbed.columns)
     for name in results.columns:
@@ -79,6 +80,7 @@ def check_equal(results: Results, undisturbed: Results, tolerance=0.0):
 
 @pytest.fixture(scope="module")
 def undisturbed():
+    """Return the results of the run without interruption."""
     return simulate(fast_scene(), frames=slice(0, 40, 2))
 
 

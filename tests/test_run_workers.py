@@ -21,6 +21,7 @@ EFFORT = ("body_seconds", "query_seconds", "contact_seconds", "iterations")
 
 @pytest.fixture(scope="module")
 def serial():
+    """Return the results of a run in one process."""
     return simulate(SCENE, frames=slice(0, 101, 8))
 
 

@@ -45,6 +45,7 @@ def test_unchanged_results_are_verified(run, capfd):
 
 
 def change_cell(out):
+    """Increase one number of results.csv by 5 %."""
     path = out / "results.csv"
     header, first, *other_lines = path.read_text().splitlines()
     cells = first.split(",")
@@ -61,6 +62,7 @@ def change_map(out):
 
 
 def change_summary(out):
+    """Increase the body mass in summary.json."""
     path = out / "summary.json"
     content = json.loads(path.read_text())
     path.write_text(json.dumps(content | {"body_mass_kg": content["body_mass_kg"] + 1}))
