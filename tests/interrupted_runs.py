@@ -31,10 +31,10 @@ def broken_off(after):
     """Return a `progress` function that raises KeyboardInterrupt after a number of jobs."""
 
     def progress(jobs, count=None):
-        for index, one in enumerate(jobs):
+        for index, job in enumerate(jobs):
             if index == after:
                 raise KeyboardInterrupt
-            yield one
+            yield job
 
     return progress
 
@@ -69,18 +69,18 @@ def interrupted(scene, stops, **options):
         return simulate(scene, **arguments)
 
 
-def deviations(found, whole):
+def deviations(results, reference):
     """Return column -> difference of two runs over its tolerance."""
-    assert found.status == whole.status
+    assert results.status == reference.status
     result = {}
-    for name in whole.columns:
+    for name in reference.columns:
         if name in (*CLOCKS, *EFFORT, *RESIDUALS):
             continue
-        a, b = found[name], whole[name]
+        a, b = results[name], reference[name]
         assert np.array_equal(np.isnan(a), np.isnan(b)), name
         peak = max(float(np.abs(np.nan_to_num(b)).max()), 1e-9)
         if name.endswith("_N"):
-            peak = float(np.nanmax(whole["force_total_N"]))
+            peak = float(np.nanmax(reference["force_total_N"]))
         elif name.endswith("above_yield"):
             peak = 1.0
         tolerance = next((t for end, t in TOLERANCES.items() if name.endswith(end)), OTHER)

@@ -1,4 +1,4 @@
-"""Results folders without a report, since drawing it takes long."""
+"""Results folders without a report, because drawing the report is slow."""
 
 from tkamb.files import replaced_together
 from tkamb.io.claim import claimed_directory
@@ -7,7 +7,7 @@ from tkamb.run.results_folder import put_numbers
 
 
 def keep(results, folder, maps=None):
-    """Write results without a report into a folder, and return the folder.
+    """Write results without a report, and return the folder.
 
     Args:
         results: the results.

@@ -19,9 +19,9 @@ CHANNELS = {"vaslat": "VL", "semimem": "SM", "gasmed": "MG", "glmed1": "GM", "gl
 CHANNELS |= {"soleus": "SOL", "tibant": "TA"}
 ACROSS = (*GROUPS["thigh to shank"], *GROUPS["thigh to foot"])
 STRENGTH_N = 900.0
-KEPT = ["time_s", "flexion_deg", "status", "force_si_N", "force_total_N", "force_total_BW"]
-KEPT += ["quadriceps_N", "patellar_ligament_N", "patellofemoral_N"]
-KEPT += [
+PLAIN_COLUMNS = ["time_s", "flexion_deg", "status", "force_si_N", "force_total_N", "force_total_BW"]
+PLAIN_COLUMNS += ["quadriceps_N", "patellar_ligament_N", "patellofemoral_N"]
+PLAIN_COLUMNS += [
     f"{side}_{kind}"
     for side in ("medial", "lateral")
     for kind in ("force_N", "force_equilibrium_N")
@@ -33,7 +33,7 @@ def muscle_run(frames: int = 56) -> Results:
     """Return the run. One frame has failed, and the last two have no measured force."""
     plain = make_run("gait", frames, maps=False)
     s = np.linspace(0, 1, frames)
-    columns = {name: plain.columns[name] for name in KEPT}
+    columns = {name: plain.columns[name] for name in PLAIN_COLUMNS}
     failed = np.array([status == "singular" for status in columns["status"]])
     columns["status"] = ["failed: singular" if bad else "ok" for bad in failed]
     names = [name for group in GROUPS.values() for name in group]
@@ -49,8 +49,8 @@ def muscle_run(frames: int = 56) -> Results:
         parts = {name: share * columns[f"muscle_{name}_N"] for name in ACROSS}
         parts["quadriceps"] = share * columns["quadriceps_N"]
         parts["ligaments"] = np.full(frames, 30.0)
-        rest = columns[f"{side}_force_equilibrium_N"] - sum(parts.values())
-        for name, part in (parts | {"external": rest}).items():
+        external = columns[f"{side}_force_equilibrium_N"] - sum(parts.values())
+        for name, part in (parts | {"external": external}).items():
             columns[f"{side}_from_{name}_N"] = part
         measured = 0.9 * columns[f"{side}_force_equilibrium_N"] + 40 * np.sin(9 * s)
         columns[f"measured_{side}_N"] = np.where(s > 0.97, np.nan, measured)

@@ -25,6 +25,7 @@ def wrong_scene(folder, degrees, raised_mm):
 
 
 def with_and_without(path):
+    """Yield the results with the adjustment, then those without."""
     return (
         simulate(load_scene(path, {"contact.adjust": adjust, "motion.frames": 26}), frames=FRAMES)
         for adjust in (True, False)
@@ -32,6 +33,7 @@ def with_and_without(path):
 
 
 def split(results):
+    """Return the medial share of the condylar forces by deformation."""
     return results["medial_force_N"] / (results["medial_force_N"] + results["lateral_force_N"])
 
 
@@ -47,7 +49,7 @@ def test_the_adjustment_leaves_the_shipped_total_alone(tmp_path):
 @pytest.mark.parametrize("degrees", [0.35, pytest.param(-0.35, marks=pytest.mark.slow)])
 def test_the_adjustment_corrects_the_split_of_a_coronal_error(tmp_path, degrees):
     """With errors of 0.35 deg and 0.3 mm the total changes by 0.006 BW."""
-    right = next(with_and_without(wrong_scene(tmp_path / "right", 0.0, 0.0)))
+    reference = next(with_and_without(wrong_scene(tmp_path / "right", 0.0, 0.0)))
     adjusted, recorded = with_and_without(wrong_scene(tmp_path / "wrong", degrees, 0.3))
     change = adjusted["force_total_BW"] - recorded["force_total_BW"]
     assert 1e-6 < np.abs(change).max() < 0.01
@@ -58,7 +60,7 @@ def test_the_adjustment_corrects_the_split_of_a_coronal_error(tmp_path, degrees)
     assert any("contradicts" in status for status in recorded.status)
     assert (np.abs(adjusted["adjust_coronal_deg"]) > 0.3).all()
     np.testing.assert_array_equal(adjusted["adjust_restored"], 0)
-    error = [np.abs(split(results) - split(right)).max() for results in (adjusted, recorded)]
+    error = [np.abs(split(results) - split(reference)).max() for results in (adjusted, recorded)]
     assert error[0] < 0.2 * error[1]
 
 
@@ -69,9 +71,9 @@ def test_a_total_that_depends_on_the_adjustment_is_flagged(tmp_path):
     change = adjusted["force_total_BW"] - recorded["force_total_BW"]
     np.testing.assert_allclose(adjusted["adjust_force_change_BW"], change, rtol=1e-9)
     assert (np.abs(change) > 0.01).any()
-    for status, one in zip(adjusted.status, change, strict=True):
+    for status, frame_change in zip(adjusted.status, change, strict=True):
         flagged = "femoral adjustment changes the total" in status
-        assert flagged == (abs(one) > 0.01)
+        assert flagged == (abs(frame_change) > 0.01)
 
 
 def test_a_restored_frame_has_its_contact_points_at_the_recorded_rotation(tmp_path):

@@ -22,6 +22,7 @@ FRAMES = slice(10, 91, 40)
 
 @pytest.fixture(scope="module")
 def bend():
+    """Return the results of three frames of the shipped bend."""
     return simulate(fast_scene(), frames=FRAMES)
 
 
@@ -35,7 +36,7 @@ def test_slip_velocity_by_arcs_is_that_of_the_rigid_body(bend, side):
 
 @pytest.mark.parametrize("side", ["medial", "lateral"])
 def test_the_shipped_motion_satisfies_the_contact_constraint(bend, side):
-    """Its poses are first touches of smooth surfaces. The facets cause up to 0.1 mm/s."""
+    """The poses are first touches of smooth surfaces. The facets of the meshes cause 0.1 mm/s."""
     assert np.abs(bend[f"{side}_normal_velocity_mm_per_s"]).max() < 0.1
 
 
@@ -57,8 +58,8 @@ def test_strains_and_first_wrapping_are_in_the_summary(bend):
     assert list(strains["flexion_deg"]) == [0.0, 60.0, 90.0]
     assert set(strains["strain"]) == {bundle.name for bundle in load_scene(fast_scene()).ligament}
     assert all(abs(strain) < 0.2 for row in strains["strain"].values() for strain in row)
-    wrapped = bend["flexion_deg"][bend["quadriceps_wrap_deg"] > 0]
-    assert bend.summary["first_wrapping_flexion_deg"] == wrapped.min()
+    wrapping_flexion = bend["flexion_deg"][bend["quadriceps_wrap_deg"] > 0]
+    assert bend.summary["first_wrapping_flexion_deg"] == wrapping_flexion.min()
     table = strain_table(bend.summary)
     rows = {name: cells for name, *cells in table.rows}
     assert "PCL_anterolateral" in rows
@@ -70,12 +71,12 @@ def test_roll_slip_with_the_recorded_slip_is_the_recorded_motion():
     """For a motion in contact, rolling plus slip gives the recorded AP, and contact gives SI."""
     recorded = load_case(load_scene(fast_scene(), FEW)).motion
     case = load_case(load_scene(fast_scene(), FEW | {"motion.motion": "roll-slip"}))
-    rolled = case.motion
-    np.testing.assert_array_equal(rolled.coordinates[:, 2:], recorded.coordinates[:, 2:])
-    np.testing.assert_allclose(rolled.coordinates[:, 0], recorded.coordinates[:, 0], atol=1e-4)
-    np.testing.assert_allclose(rolled.coordinates[:, 1], recorded.coordinates[:, 1], atol=3e-5)
+    rolling = case.motion
+    np.testing.assert_array_equal(rolling.coordinates[:, 2:], recorded.coordinates[:, 2:])
+    np.testing.assert_allclose(rolling.coordinates[:, 0], recorded.coordinates[:, 0], atol=1e-4)
+    np.testing.assert_allclose(rolling.coordinates[:, 1], recorded.coordinates[:, 1], atol=3e-5)
     query = ClosestPointQuery(case.femoral, case.insert, case.split)
-    for pose in knee_pose(rolled.coordinates[::6]):
+    for pose in knee_pose(rolling.coordinates[::6]):
         gaps = query.at(pose)
         assert min(abs(gaps.medial.gap), abs(gaps.lateral.gap)) < 2e-6
 
@@ -147,18 +148,18 @@ def test_a_long_motion_stores_no_chain_state_per_frame(monkeypatch):
     """A state with its Pinocchio data has a quarter of a MB."""
     at, states = Chain.at, []
 
-    def watched(self, motion):
+    def recorded_at(self, motion):
         state = at(self, motion)
         states.append(weakref.ref(state))
         return state
 
-    monkeypatch.setattr(Chain, "at", watched)
+    monkeypatch.setattr(Chain, "at", recorded_at)
     mechanics = mechanics_of(load_case(load_scene(fast_scene(), FEW)))
     assert mechanics.ligaments
     for k in range(len(mechanics.motion)):
         mechanics.geometry(k)
     assert len(states) >= 26
-    assert sum(one() is not None for one in states) <= 1
+    assert sum(state_reference() is not None for state_reference in states) <= 1
 
 
 def test_a_frame_with_contact_out_of_range_has_no_forces(tmp_path):
@@ -171,9 +172,9 @@ def test_a_frame_with_contact_out_of_range_has_no_forces(tmp_path):
     rows[60:, forces] *= 30.0
     np.savetxt(file, rows, "%.9g", ",", header=header, comments="")
     results = simulate(path, frames=slice(40, 71, 30))
-    carried, crushed = results.columns["status"]
-    assert not carried.startswith("failed")
-    assert crushed.startswith("failed: contact out of range")
+    light_status, heavy_status = results.columns["status"]
+    assert not light_status.startswith("failed")
+    assert heavy_status.startswith("failed: contact out of range")
     motion = {"time_s", "flexion_deg", "adduction_deg", "axial_rotation_deg"}
     numbers = {n for n, v in results.columns.items() if n != "status" and np.isfinite(v[1])}
     assert motion <= numbers <= {*motion, *WHY_IT_FAILED}

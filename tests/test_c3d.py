@@ -42,19 +42,22 @@ def plate_signals(kind: int, corners: np.ndarray, origin: np.ndarray) -> np.ndar
     if kind == 1:
         turned = (np.array([0, 0, 1.0]) @ axes.T)[2] * free
         return np.column_stack([f, p[:, :2] * 1e3, turned * 1e3]).T
-    about = m + np.cross(origin if kind != 3 else [0, 0, origin[2]], f)
+    moment_about_origin = m + np.cross(origin if kind != 3 else [0, 0, origin[2]], f)
     if kind != 3:
-        return np.column_stack([f, about * 1e3]).T
-    # any distribution over the eight sensors with this force and moment
+        return np.column_stack([f, moment_about_origin * 1e3]).T
+    # one of many distributions over the eight sensors with this force and moment
     fx = [f[:, 0] / 2, f[:, 0] / 2]
-    fy = [f[:, 1] / 2 + about[:, 2] / (2 * A), f[:, 1] / 2 - about[:, 2] / (2 * A)]
-    roll, pitch = about[:, 0] / (4 * B), about[:, 1] / (4 * A)
+    fy = [
+        f[:, 1] / 2 + moment_about_origin[:, 2] / (2 * A),
+        f[:, 1] / 2 - moment_about_origin[:, 2] / (2 * A),
+    ]
+    roll, pitch = moment_about_origin[:, 0] / (4 * B), moment_about_origin[:, 1] / (4 * A)
     quarter = f[:, 2] / 4
     fz = [quarter + roll - pitch, quarter + roll + pitch, quarter - roll + pitch]
     return np.array([*fx, *fy, *fz, quarter - roll - pitch])
 
 
-FLIPPED = AMTI_CORNERS[[1, 0, 3, 2]]  # x and z of the plate turned: its z points down
+FLIPPED = AMTI_CORNERS[[1, 0, 3, 2]]  # x and z are reversed, so that z points down
 
 
 @pytest.mark.parametrize("corners", [AMTI_CORNERS, FLIPPED], ids=["up", "down"])
@@ -87,11 +90,13 @@ def test_each_plate_type_gives_the_applied_wrench(tmp_path, kind, corners):
 
 def two_plates(tmp_path: Path, **more) -> Path:
     """Write a recording with half of the load on each of two plates of type 2."""
-    beside = AMTI_CORNERS + np.array([0.0, 0.5, 0.0])
-    halves = [0.5 * plate_signals(2, corners, np.zeros(3)) for corners in (AMTI_CORNERS, beside)]
+    second_corners = AMTI_CORNERS + np.array([0.0, 0.5, 0.0])
+    halves = [
+        0.5 * plate_signals(2, corners, np.zeros(3)) for corners in (AMTI_CORNERS, second_corners)
+    ]
     plates = [
         {"type": 2, "corners": AMTI_CORNERS, "channels": range(1, 7)},
-        {"type": 2, "corners": beside, "channels": range(7, 13)},
+        {"type": 2, "corners": second_corners, "channels": range(7, 13)},
     ]
     signals = np.concatenate(halves)
     return write_c3d(
@@ -112,9 +117,9 @@ def test_one_foot_on_two_plates_has_the_sum_of_their_wrenches(tmp_path):
     time = read_c3d(path).analog_time
     ground = load_ground_reaction(table, time, "right")
     force, point, free = pushes()
-    into = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-    np.testing.assert_allclose(ground.force, force @ into.T, atol=1e-3)
-    np.testing.assert_allclose(ground.point, point @ into.T, atol=1e-5)
+    axes_rotation = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    np.testing.assert_allclose(ground.force, force @ axes_rotation.T, atol=1e-3)
+    np.testing.assert_allclose(ground.point, point @ axes_rotation.T, atol=1e-5)
     np.testing.assert_allclose(ground.moment[:, 1], free, atol=1e-3)
     assert ground.loaded.all()
     on_plate = table.model_copy(update={"force": "on the plate"})
@@ -152,8 +157,10 @@ def test_the_centre_of_pressure_on_a_step_is_on_the_same_line_of_action(tmp_path
     shift = step.point - flat.point
     np.testing.assert_allclose(np.cross(shift, flat.force)[:, [0, 2]], 0.0, atol=1e-9)
     for ground in reactions.values():
-        about = ground.moment + np.cross(ground.point, ground.force)
-        np.testing.assert_allclose(about, flat.moment + np.cross(flat.point, flat.force), atol=1e-9)
+        moment_about_origin = ground.moment + np.cross(ground.point, ground.force)
+        np.testing.assert_allclose(
+            moment_about_origin, flat.moment + np.cross(flat.point, flat.force), atol=1e-9
+        )
         np.testing.assert_allclose(ground.moment[:, [0, 2]], 0.0, atol=1e-9)
     table = GroundReactionTable(file=tmp_path / "x.mot", cutoff_Hz="none", surface_mm=1.0)
     with pytest.raises(InputError, match="surface_mm"):
@@ -168,9 +175,11 @@ def test_the_wrench_below_the_force_threshold_is_unchanged(tmp_path):
     recording = read_c3d(path)
     ground = load_ground_reaction(table, recording.analog_time, "right")
     assert 0 < ground.loaded.sum() < len(ground.loaded)
-    into = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-    about = ground.moment + np.cross(ground.point, ground.force)
-    np.testing.assert_allclose(about, recording.plates[0].wrench[:, 3:] @ into.T, atol=1e-6)
+    axes_rotation = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    moment_about_origin = ground.moment + np.cross(ground.point, ground.force)
+    np.testing.assert_allclose(
+        moment_about_origin, recording.plates[0].wrench[:, 3:] @ axes_rotation.T, atol=1e-6
+    )
 
 
 def test_times_count_from_the_first_frame_of_the_recording(tmp_path):
@@ -211,6 +220,7 @@ def test_labels_match_independent_of_prefix_and_dots():
 
 
 def written(tmp_path: Path, **changes) -> Path:
+    """Write a recording of one plate under `pushes`, with changed arguments of `write_c3d`."""
     signals = plate_signals(2, AMTI_CORNERS, np.zeros(3))
     plate = {"type": 2, "channels": list(range(1, 7))} | changes.pop("plate", {})
     arguments = {
@@ -221,27 +231,31 @@ def written(tmp_path: Path, **changes) -> Path:
     return write_c3d(tmp_path / "bad.c3d", standing_markers(COUNT), **arguments)
 
 
-def cut(path: Path, share: float) -> Path:
+def truncated(path: Path, share: float) -> Path:
+    """Shorten a file to a share of its length, and return its path."""
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
     return path
 
 
-def stating(path: Path, analog_rate: float) -> Path:
-    """Change ANALOG:RATE, the second RATE in the file."""
+def with_analog_rate(path: Path, analog_rate: float) -> Path:
+    """Change ANALOG:RATE, the second RATE in the file, and return the path."""
     content = bytearray(path.read_bytes())
-    at = content.index(b"RATE", content.index(b"RATE") + 4) + 8
-    content[at : at + 4] = struct.pack("<f", analog_rate)
+    offset = content.index(b"RATE", content.index(b"RATE") + 4) + 8
+    content[offset : offset + 4] = struct.pack("<f", analog_rate)
     path.write_bytes(content)
     return path
 
 
 REFUSED = {
-    "analog rate no multiple": (lambda d: stating(written(d), 1050.0), "no multiple"),
-    "analog rate of other samples": (lambda d: stating(written(d), 2000.0), "10 samples a frame"),
-    "analog rate below the markers'": (lambda d: stating(written(d), 50.0), "no multiple"),
-    "half of the file": (lambda d: cut(written(d), 0.5), "cut short"),
-    "no parameters": (lambda d: cut(written(d), 0.02), "C3D"),
+    "analog rate no multiple": (lambda d: with_analog_rate(written(d), 1050.0), "no multiple"),
+    "analog rate of other samples": (
+        lambda d: with_analog_rate(written(d), 2000.0),
+        "10 samples a frame",
+    ),
+    "analog rate below the markers'": (lambda d: with_analog_rate(written(d), 50.0), "no multiple"),
+    "half of the file": (lambda d: truncated(written(d), 0.5), "cut short"),
+    "no parameters": (lambda d: truncated(written(d), 0.02), "C3D"),
     "text": (lambda d: text(d, "not a recording at all" * 100), "not a C3D file"),
     "empty": (lambda d: text(d, ""), "not a C3D file"),
     "not there": (lambda d: d / "none.c3d", "no such file"),
@@ -266,6 +280,7 @@ REFUSED = {
 
 
 def text(folder: Path, content: str) -> Path:
+    """Write a text into a file with the suffix of a recording."""
     path = folder / "text.c3d"
     path.write_text(content)
     return path

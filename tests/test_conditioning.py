@@ -23,11 +23,13 @@ MIDDLE = 60
 
 @cache
 def mechanics(friction: float = 0.05) -> Mechanics:
+    """Return the equations of the shipped bend."""
     return mechanics_of(load_case(load_scene(MODEL / "scene.toml", {"contact.friction": friction})))
 
 
 @cache
 def shipped_frame() -> FrameLoads:
+    """Return the solved middle frame of the shipped bend."""
     return mechanics().frame(MIDDLE)
 
 
@@ -47,10 +49,10 @@ def solved_with_arm(arm: float):
     to_contact = contact_axis(shipped_frame()) - on_patella.points[0]
     distance = np.hypot(*to_contact[:2])
     angle = np.arctan2(to_contact[1], to_contact[0]) + np.arcsin(arm / distance)
-    along = np.array([[np.cos(angle), np.sin(angle), 0.0]])
+    direction = np.array([[np.cos(angle), np.sin(angle), 0.0]])
     ligament = (
-        replace(on_patella, forces=along),
-        replace(on_tibia, points=on_patella.points, forces=-along),
+        replace(on_patella, forces=direction),
+        replace(on_tibia, points=on_patella.points, forces=-direction),
     )
     extensor = replace(geometry.extensor, patellar_ligament=ligament)
     return solve_knee(replace(geometry, extensor=extensor), 0.05)
@@ -97,7 +99,7 @@ def test_a_singular_frame_fails_and_the_other_frames_do_not(tmp_path):
 
 
 def test_a_quadriceps_through_the_patellofemoral_contact_makes_the_equations_singular():
-    """It cannot balance the patellar ligament at any tension."""
+    """Such a quadriceps cannot balance the patellar ligament."""
     geometry = shipped_frame().geometry
     quadriceps = geometry.muscles[0].loads
     (on_patella,) = (load for load in quadriceps if load.link == "patella")
@@ -118,9 +120,9 @@ def test_a_condyle_s_force_is_at_the_friction_angle_from_its_normal(friction):
     for side, condyle in frame.geometry.condyles.items():
         force = condyle.direction(friction) * frame.loads.values[f"{side}_normal"]
         normal = force @ condyle.normal
-        across = force - normal * condyle.normal
-        assert np.linalg.norm(across) == pytest.approx(friction * normal, rel=0.02, abs=1e-9)
-        assert across @ condyle.sliding <= 1e-12 * normal  # rounding if there is no friction
+        tangential = force - normal * condyle.normal
+        assert np.linalg.norm(tangential) == pytest.approx(friction * normal, rel=0.02, abs=1e-9)
+        assert tangential @ condyle.sliding <= 1e-12 * normal  # rounding if there is no friction
     total = np.linalg.norm(frame.loads.contact_force)
     assert total == pytest.approx(np.linalg.norm(shipped_frame().loads.contact_force), rel=0.5)
 
@@ -141,7 +143,7 @@ def test_noise_of_fluoroscopy_is_flagged(tmp_path):
     path = noisy_scene(tmp_path)
     case = load_case(load_scene(path, {"contact.adjust": True}))
     noisy = mechanics_of(case)
-    changes, flagged = [], 0
+    changes, flag_count = [], 0
     for k in range(5, 101, 15):
         frame = noisy.frame(k)
         status, force = frame_status(case, k, frame, None), frame.loads.contact_force
@@ -149,9 +151,9 @@ def test_noise_of_fluoroscopy_is_flagged(tmp_path):
         if status.startswith(FAILED):
             continue
         assert frame.loads.condition < UNKNOWNS.max_condition
-        flagged += "filter moves the recorded pose" in status
+        flag_count += "filter moves the recorded pose" in status
         clean = mechanics().frame(k).loads.contact_force
         changes.append((np.linalg.norm(force) - np.linalg.norm(clean)) / case.body_weight)
     assert len(changes) >= 6
-    assert flagged >= 4
+    assert flag_count >= 4
     assert np.sqrt(np.mean(np.square(changes))) < 0.15

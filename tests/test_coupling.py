@@ -17,6 +17,7 @@ COARSE = {"contact.resolution_mm": 2.0}
 
 
 def run(**contact):
+    """Return the results of six frames with changed keys of [contact]."""
     overrides = COARSE | {f"contact.{key}": value for key, value in contact.items()}
     return simulate(load_scene(SCENE, overrides), frames=FRAMES)
 
@@ -33,21 +34,23 @@ def coupled():
 
 @pytest.fixture(scope="module")
 def tilting():
+    """Return the results with released adduction."""
     return run(released=["adduction"])
 
 
 def shares(results):
+    """Return the medial share by deformation, and that by coronal equilibrium."""
     medial, lateral = results["medial_force_N"], results["lateral_force_N"]
     return medial / (medial + lateral), results["medial_share_equilibrium"]
 
 
-def test_an_uncoupled_frame_is_a_press_with_the_load_of_the_equations():
+def test_an_uncoupled_frame_is_a_contact_solution_at_the_load_of_the_equations():
     case = load_case(load_scene(SCENE, COARSE))
     mechanics = mechanics_of(case)
     side = contact_side(case, mechanics)
     body, contact = side.frame(60)
-    alone = mechanics.frame(60)
-    load = alone.loads.contact_force[1]
+    uncoupled_body = mechanics.frame(60)
+    load = uncoupled_body.loads.contact_force[1]
     pressed = side.model.press(side.state, load, mechanics.poses[60], None)
     assert body.loads.contact_force[1] == load
     assert np.array_equal(contact.result.pressure, pressed.pressure)
@@ -73,8 +76,8 @@ def test_both_estimates_of_the_split_agree_with_released_adduction(uncoupled, ti
     assert np.abs(deformed - balanced).max() > 0.02
     deformed, balanced = shares(tilting)
     assert np.abs(deformed - balanced).max() < 1e-3
-    turned = tilting["adduction_deg"] - uncoupled["adduction_deg"]
-    assert 1e-3 < np.abs(turned).max() < 0.2
+    rotation = tilting["adduction_deg"] - uncoupled["adduction_deg"]
+    assert 1e-3 < np.abs(rotation).max() < 0.2
     assert np.allclose(tilting["axial_rotation_deg"], uncoupled["axial_rotation_deg"])
     for axis in ("ap", "ml"):
         assert np.allclose(tilting[f"{axis}_mm"], uncoupled[f"{axis}_mm"], atol=1e-9)

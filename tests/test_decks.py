@@ -37,6 +37,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def pressed(folder):
+    """Return the contact problem and the result of the frame."""
     return frame_press(folder, 0)
 
 
@@ -77,21 +78,25 @@ def test_the_deck_states_frame_model_approach_and_load(folder, pressed, tmp_path
 def test_the_febio_deck_has_the_same_bodies_and_the_approach(pressed):
     root = ElementTree.fromstring(pressed.deck("feb"))
     assert root.get("version") == "4.0"
-    places = [one.text.split(",") for one in root.findall("Mesh/Nodes/node")]
-    nodes = np.array(places, float) * 1e-3
+    texts = [element.text.split(",") for element in root.findall("Mesh/Nodes/node")]
+    nodes = np.array(texts, float) * 1e-3
     lattice, patch = pressed.problem.lattice, pressed.problem.patch
     count = len(lattice.nodes)
     np.testing.assert_allclose(nodes[:count], lattice.nodes, atol=1e-10)
-    cells = [one.text.split(",") for one in root.findall("Mesh/Elements[@name='insert']/elem")]
+    cells = [
+        element.text.split(",") for element in root.findall("Mesh/Elements[@name='insert']/elem")
+    ]
     np.testing.assert_array_equal(np.array(cells, int) - 1, lattice.cells)
-    lifted = nodes[count:] - patch.vertices
-    np.testing.assert_allclose(lifted, [[0, pressed.problem.depth, 0]] * len(lifted), atol=1e-10)
+    displacement = nodes[count:] - patch.vertices
+    np.testing.assert_allclose(
+        displacement, [[0, pressed.problem.depth, 0]] * len(displacement), atol=1e-10
+    )
     (travel,) = root.findall("Rigid/rigid_bc[@type='rigid_displacement']/value")
     assert float(travel.text) == pytest.approx(-pressed.approach * 1e3)
     quads = contact_quads(lattice)
     a, b, c, d = (lattice.nodes[quads[:, k]] for k in range(4))
-    up = np.cross(c - a, d - b)[:, 1]
-    assert len(quads) > 50 and (up > 0).all()  # outward of the articular surface is upward
+    vertical = np.cross(c - a, d - b)[:, 1]
+    assert len(quads) > 50 and (vertical > 0).all()  # outward of the articular surface is upward
     assert set(np.unique(lattice.contact_triangles)) == set(np.unique(quads))
 
 
@@ -107,9 +112,9 @@ def test_a_deck_states_its_differences_from_the_run(folder, pressed, tmp_path, c
     for kind, suffix in (("ccx", "inp"), ("feb", "feb")):
         out = tmp_path / f"frame.{suffix}"
         assert main(["export", str(other), "--deck", kind, "--frame", "0", "--out", str(out)]) == 0
-        said = capsys.readouterr().out
+        output = capsys.readouterr().out
         for words in ("not in this deck: 123 N, peak 9.5 MPa", "computed as its mirror image"):
-            assert words in out.read_text() and words in said
+            assert words in out.read_text() and words in output
         assert "z medial" in out.read_text()
     assert main(["export", str(other), "--vtp", "--out", str(tmp_path / "vtp")]) == 0
     assert "without the post's pressure" in capsys.readouterr().out
@@ -127,5 +132,5 @@ def test_a_missing_frame_is_refused_in_one_line(folder, tmp_path, capsys, frame,
     out = tmp_path / "frame.inp"
     command = ["export", str(folder), "--deck", "ccx", f"--frame={frame}", "--out", str(out)]
     assert main(command) == 2
-    said = capsys.readouterr().err
-    assert words in said and said.count("\n") == 1 and not out.exists()
+    output = capsys.readouterr().err
+    assert words in output and output.count("\n") == 1 and not out.exists()

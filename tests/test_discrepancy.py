@@ -79,9 +79,9 @@ def test_the_band_of_inputs_and_discrepancy_covers_another_trial():
         of_activity = rng.standard_normal()  # m and b of tkamb.run.discrepancy with S = 0.4
         biases = 0.4 * (of_activity + rng.standard_normal(9)) / np.sqrt(2)
         trials = [one_trial(rng, str(k), bias=bias, frames=10) for k, bias in enumerate(biases)]
-        found = fitted([one[0] for one in trials[1:]], "total", "walking")
+        discrepancy = fitted([one[0] for one in trials[1:]], "total", "walking")
         _, samples, truth, load = trials[0]
-        shares.append(coverage(*band_with_discrepancy(samples, found, load), truth)[1])
+        shares.append(coverage(*band_with_discrepancy(samples, discrepancy, load), truth)[1])
     assert 0.85 <= np.mean(shares) <= 0.95
 
 
@@ -97,21 +97,21 @@ def test_only_the_bias_of_the_same_activity_shifts_a_band():
 def test_a_band_with_discrepancy_is_never_negative_and_nan_without_samples():
     samples = np.full((30, 2), 100.0)
     samples[:, 1] = np.nan
-    found = Discrepancy(0.0, 1.0, 4.0, 1, 3)
-    low, high = band_with_discrepancy(samples, found, np.full(2, 700.0))
+    discrepancy = Discrepancy(0.0, 1.0, 4.0, 1, 3)
+    low, high = band_with_discrepancy(samples, discrepancy, np.full(2, 700.0))
     assert low[0] == 0.0 and high[0] > 100.0 + 1.64 * 700.0  # Student's t is wider
     assert np.isnan([low[1], high[1]]).all()
-    assert np.isnan(band_with_discrepancy(samples[:, 1:], found, np.full(1, 700.0))).all()
+    assert np.isnan(band_with_discrepancy(samples[:, 1:], discrepancy, np.full(1, 700.0))).all()
 
 
 SUMMARY = {"scene_tables": {"muscles": {}}, "activity": "squat"}
 
 
-def test_the_package_knows_three_trials_of_one_subject():
-    known = known_errors()
-    assert {one.force for one in known} == set(FORCES)
-    assert {one.trial for one in known} == {"ngait_og3", "ngait_og1", "squat"}
-    assert {one.subject for one in known} == {"JW"}
+def test_the_package_has_errors_of_three_trials_of_one_subject():
+    errors = known_errors()
+    assert {error.force for error in errors} == set(FORCES)
+    assert {error.trial for error in errors} == {"ngait_og3", "ngait_og1", "squat"}
+    assert {error.subject for error in errors} == {"JW"}
     assert set(discrepancy_of(SUMMARY)) == set(FORCES)
     assert discrepancy_of({"activity": "squat"}) == {}
 
@@ -148,21 +148,21 @@ def test_peaks_and_saturated_muscles_of_a_run():
         "activation_vaslat": np.array([nan, 1.0, 0.3]),
         "activation_soleus": np.array([nan, 0.2, 0.3]),
     }
-    found = peaks(columns, 700.0)
-    assert found["total"] == {"nominal": 2.0, "frame": 1, "time_s": 1.0, "flexion_deg": 2.0}
-    assert found["medial"]["nominal"] == 1.0 and "lateral" not in found
+    peak = peaks(columns, 700.0)
+    assert peak["total"] == {"nominal": 2.0, "frame": 1, "time_s": 1.0, "flexion_deg": 2.0}
+    assert peak["medial"]["nominal"] == 1.0 and "lateral" not in peak
     assert saturated_muscles(columns) == {"vaslat": 1}
 
 
-def test_default_errors_depend_on_the_recording_and_given_errors_are_unchanged():
+def test_default_errors_depend_on_the_recording_and_errors_of_the_scene_are_unchanged():
     markers, fluoroscopy = (UncertaintyTable().completed(one) for one in (True, False))
     assert fluoroscopy.flexion_deg == FLUOROSCOPY_ERROR.flexion_deg
     assert markers.flexion_deg == SKIN_MARKER_ERROR.flexion_deg
-    given = UncertaintyTable.model_validate({"flexion_deg": 0.1, "ap_mm": 0.0})
-    assert given.completed(True).flexion_deg == 0.1 and given.completed(True).ap_mm == 0.0
+    table = UncertaintyTable.model_validate({"flexion_deg": 0.1, "ap_mm": 0.0})
+    assert table.completed(True).flexion_deg == 0.1 and table.completed(True).ap_mm == 0.0
 
 
-def test_the_influential_input_is_found_with_few_samples():
+def test_the_influential_input_is_identified_with_few_samples():
     rng, count = np.random.default_rng(5), 60
     x = rng.standard_normal((100, 1, count))
     y = (3.0 * x[:, :, 7] + 0.3 * rng.standard_normal((100, 1)))[:, None, :]

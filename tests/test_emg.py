@@ -24,27 +24,27 @@ INSIDE = slice(600, -600)
 def test_the_envelope_of_a_sine_is_its_rectified_mean():
     signal = 0.3 + 2.0 * np.sin(2 * np.pi * 97.3 * TIME)
     for high_pass in (20.0, "none"):
-        found = envelope(signal, RATE, 6.0, high_pass)[INSIDE]
-        np.testing.assert_allclose(found, 2 * 2.0 / np.pi, rtol=5e-3)
+        result = envelope(signal, RATE, 6.0, high_pass)[INSIDE]
+        np.testing.assert_allclose(result, 2 * 2.0 / np.pi, rtol=5e-3)
 
 
 def test_the_envelope_has_no_phase_and_half_the_amplitude_at_the_cutoff():
     """The amplitude of a carrier at 150 Hz oscillates at the cut-off of the low-pass filter."""
     swing = 1 + 0.5 * np.sin(2 * np.pi * 5.0 * TIME)
-    found = envelope(swing * np.sin(2 * np.pi * 151.7 * TIME), RATE, 5.0, 30.0)[INSIDE]
+    result = envelope(swing * np.sin(2 * np.pi * 151.7 * TIME), RATE, 5.0, 30.0)[INSIDE]
     expected = 2 / np.pi * (1 + 0.25 * np.sin(2 * np.pi * 5.0 * TIME[INSIDE]))
-    np.testing.assert_allclose(found, expected, atol=0.01)
+    np.testing.assert_allclose(result, expected, atol=0.01)
 
 
 @pytest.mark.parametrize("high_pass", [20.0, "none"])
 def test_the_envelope_is_that_of_filters_run_forwards_and_backwards(high_pass):
     signal = np.random.default_rng(3).normal(size=len(TIME)) * (1.2 + np.sin(5.0 * TIME))
-    found, expected = envelope(signal, RATE, 6.0, high_pass), signal - signal.mean()
+    result, expected = envelope(signal, RATE, 6.0, high_pass), signal - signal.mean()
     if high_pass != "none":
         expected = sosfiltfilt(butter(2, high_pass, "highpass", fs=RATE, output="sos"), expected)
     expected = sosfiltfilt(butter(2, 6.0, fs=RATE, output="sos"), np.abs(expected))
     middle = slice(1500, -1500)
-    np.testing.assert_allclose(found[middle], expected[middle], atol=1e-6 * expected.max())
+    np.testing.assert_allclose(result[middle], expected[middle], atol=1e-6 * expected.max())
 
 
 def test_the_ends_of_an_envelope_have_the_mean_of_its_interior():
@@ -78,11 +78,13 @@ def test_signals_without_an_envelope_are_refused(signal, cutoff, words):
 
 
 def table(file, **changes):
+    """Return [muscles.emg] of a file with changed keys."""
     keys = {"channels": {"VL": ("vaslat",)}, "high_pass_Hz": 20.0, "cutoff_Hz": 6.0}
     return EmgTable(**({"file": file} | keys | changes))
 
 
 def burst(centre):
+    """Return a signal at 97.3 Hz with a maximum of its amplitude at a time, s."""
     return np.exp(-(((TIME - centre) / 0.2) ** 2)) * np.sin(2 * np.pi * 97.3 * TIME)
 
 
@@ -91,11 +93,11 @@ def test_channels_of_a_c3d_have_its_times_and_a_maximum_of_one(tmp_path):
     path = write_c3d(
         tmp_path / "a.c3d", markers, first_frame=50, ratio=12, analog={"VL": 3e-4 * burst(1.5)}
     )
-    found = load_envelopes(table(path, offset_s=0.04), TIME)
-    values = found.values["VL"]
+    result = load_envelopes(table(path, offset_s=0.04), TIME)
+    values = result.values["VL"]
     assert values.max() == pytest.approx(1.0)
-    assert found.time[values.argmax()] == pytest.approx(0.5 + 0.04 + 1.5, abs=0.01)
-    assert np.isnan(found.at("vaslat", np.array([0.5, 4.6]))).all()
+    assert result.time[values.argmax()] == pytest.approx(0.5 + 0.04 + 1.5, abs=0.01)
+    assert np.isnan(result.at("vaslat", np.array([0.5, 4.6]))).all()
     normalised = load_envelopes(table(path, normalised_by={"VL": 3e-4}), TIME)
     assert normalised.values["VL"].max() < 2 / np.pi
 
@@ -104,8 +106,8 @@ def test_emg_is_read_from_a_csv_table(tmp_path):
     path = tmp_path / "emg.csv"
     rows = [f"{t:.6f},{v:.9f}," for t, v in zip(TIME, burst(2.0), strict=True)]
     path.write_text("\n".join(["clock,VL,", *rows]).replace("VL,", "VL"), encoding="utf-8")
-    found = load_envelopes(table(path, time="clock"), TIME)
-    assert found.time[found.values["VL"].argmax()] == pytest.approx(2.0, abs=0.01)
+    result = load_envelopes(table(path, time="clock"), TIME)
+    assert result.time[result.values["VL"].argmax()] == pytest.approx(2.0, abs=0.01)
     with pytest.raises(
         InputError, match=r"from 9 to 12.9992 s, the motion lasts from 0 to .*offset_s"
     ):
@@ -199,13 +201,13 @@ def test_agreement_states_correlation_error_and_lag():
     activation = 0.5 * envelopes.at("vaslat", time - 0.06)
     activation[[3, 40]] = np.nan
     columns = {"time_s": time, "activation_vaslat": activation}
-    found = compare_emg(envelopes, columns)["vaslat"]
+    result = compare_emg(envelopes, columns)["vaslat"]
     finite, expected = np.isfinite(activation), envelopes.at("vaslat", time)
     activation, expected = activation[finite], expected[finite]
-    assert found["lag_s"] == pytest.approx(0.06, abs=0.0026)
-    assert found["pearson_r"] == pytest.approx(np.corrcoef(activation, expected)[0, 1])
-    assert found["rmse"] == pytest.approx(np.std(activation - expected, mean=0.0))
-    assert (found["frames_compared"], found["frames_left_out"]) == (len(time) - 2, 2)
+    assert result["lag_s"] == pytest.approx(0.06, abs=0.0026)
+    assert result["pearson_r"] == pytest.approx(np.corrcoef(activation, expected)[0, 1])
+    assert result["rmse"] == pytest.approx(np.std(activation - expected, mean=0.0))
+    assert (result["frames_compared"], result["frames_left_out"]) == (len(time) - 2, 2)
 
 
 def test_the_fitted_normalisation_makes_the_envelope_the_activation():
@@ -219,9 +221,9 @@ def test_the_fitted_normalisation_makes_the_envelope_the_activation():
     columns = {"activation_vaslat": 0.3 * course, "activation_vasint": 0.5 * course}
     columns |= {"time_s": time, "activation_soleus": np.full_like(time, np.nan)}
     columns["activation_vaslat"][[7]] = columns["activation_vasint"][[7]] = np.nan
-    found = fitted_normalisation(envelopes, columns)
-    assert found["VL"] == pytest.approx(2e-4 / 0.4)
-    assert found["SO"] is None
+    result = fitted_normalisation(envelopes, columns)
+    assert result["VL"] == pytest.approx(2e-4 / 0.4)
+    assert result["SO"] is None
 
 
 @pytest.mark.parametrize("shape", [lambda t: np.exp(-((t - 2.5) ** 2)), lambda t: 3 * t])

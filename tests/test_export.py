@@ -21,6 +21,7 @@ def folder(tmp_path_factory):
 
 
 def exported(folder, tmp_path):
+    """Return the path of the storage file of a results folder."""
     path = tmp_path / "run.sto"
     assert main(["export", str(folder), "--sto", str(path)]) == 0
     return path
@@ -33,8 +34,8 @@ def test_the_storage_file_has_every_number_under_its_name(folder, tmp_path, caps
     assert table.in_degrees is True
     for name, values in run.columns.items():
         if name != "status":
-            found = table.columns["time" if name == "time_s" else name]
-            np.testing.assert_allclose(found, values, rtol=1e-9, err_msg=name)
+            column = table.columns["time" if name == "time_s" else name]
+            np.testing.assert_allclose(column, values, rtol=1e-9, err_msg=name)
     code, ok = table.columns["status"], np.array([words == "ok" for words in run.status])
     failed = ~ok & np.isnan(run["force_total_N"])
     np.testing.assert_array_equal(code, np.where(ok, 0, np.where(failed, 2, 1)))
@@ -45,7 +46,7 @@ def test_the_storage_file_has_every_number_under_its_name(folder, tmp_path, caps
 @pytest.mark.skipif(
     importlib.util.find_spec("opensim") is None, reason="the package opensim is not installed"
 )
-def test_opensim_reads_it(folder, tmp_path):
+def test_opensim_reads_the_storage_file(folder, tmp_path):
     path = exported(folder, tmp_path)
     script = (
         "import sys, opensim; t = opensim.TimeSeriesTable(sys.argv[1]); "
@@ -75,8 +76,8 @@ def test_a_path_that_cannot_be_written_is_refused_in_one_line(
     (tmp_path / "there.sto").write_text("mine")
     (tmp_path / "no").write_text("a file")
     assert main(["export", str(folder), "--sto", str(tmp_path / name)]) == 2
-    said = capsys.readouterr().err
-    assert words in said and said.count("\n") == 1
+    output = capsys.readouterr().err
+    assert words in output and output.count("\n") == 1
     assert (tmp_path / "there.sto").read_text() == "mine"
 
 

@@ -91,13 +91,13 @@ def test_a_run_survives_any_fault(tmp_path, monkeypatch, capfd, quick_case):
             assert status == 0
             break
         kinds.add(faults.calls[number][0])
-        check_said(status, capfd.readouterr().err, faults.calls[number])
+        check_message(status, capfd.readouterr().err, faults.calls[number])
         state = check_old_or_new(out, before, 2)
         states.add(state)
         if number % 9:  # the rest takes a whole run
             continue
-        more = ["--resume"] if state == "new" else []
-        assert main([*second, *more]) == 0, (faults.calls[number], capfd.readouterr().err)
+        options = ["--resume"] if state == "new" else []
+        assert main([*second, *options]) == 0, (faults.calls[number], capfd.readouterr().err)
         assert np.array_equal(read_results(out).columns["hip_force_si_N"], expected)
         assert {p.name for p in out.iterdir() if p.name.startswith(".")} == {".tkamb"}
     else:
@@ -126,9 +126,9 @@ def test_a_study_keeps_the_rows_before_and_after_a_failed_write(tmp_path, monkey
             message = message_of(lambda rows=rows: rows.put("b", {"x": 2.0}))
             assert message is None or "cannot be written" in message
         rows.put("c", {"x": 3.0})
-        again = KeptRows(folder, True)
-        assert again.get("a") == {"x": 1.0} and again.get("c") == {"x": 3.0}
-        assert again.get("b") in (None, {"x": 2.0})
+        resumed = KeptRows(folder, True)
+        assert resumed.get("a") == {"x": 1.0} and resumed.get("c") == {"x": 3.0}
+        assert resumed.get("b") in (None, {"x": 2.0})
         if len(faults.calls) <= number:
             break
     assert number > 1
@@ -163,8 +163,8 @@ def test_a_failed_export_leaves_the_old_file(tmp_path, monkeypatch):
     assert number > 1 and path.read_bytes() == new
 
 
-def check_said(status, said, call):
+def check_message(status, output, call):
     """Check that a failure has one line, and that the error is an expected one."""
     assert status in (0, 1, 2), call
-    assert said.count("\n") == bool(status), (call, said)
-    assert "unexpected error" not in said and "Traceback" not in said, (call, said)
+    assert output.count("\n") == bool(status), (call, output)
+    assert "unexpected error" not in output and "Traceback" not in output, (call, output)

@@ -26,17 +26,17 @@ def test_each_law_follows_its_formula():
     assert isinstance(linear.law, LinearElastic)
     assert linear.stress(strain) == pytest.approx(800e6 * strain)
     numbers = {"alpha": 0.05, "reference_stress_MPa": 9.0, "exponent": 4.0}
-    bent = given_material(
+    ramberg_osgood = given_material(
         {"young_modulus_MPa": 800, "poisson_ratio": 0.4, "law": "ramberg-osgood", **numbers}
     )
-    stress = bent.stress(strain)
-    again = stress / 800e6 + 0.05 * np.abs(stress / 9e6) ** 3 * stress / 800e6
-    assert again == pytest.approx(strain, abs=1e-12)
+    stress = ramberg_osgood.stress(strain)
+    total_strain = stress / 800e6 + 0.05 * np.abs(stress / 9e6) ** 3 * stress / 800e6
+    assert total_strain == pytest.approx(strain, abs=1e-12)
     table = given_material({"poisson_ratio": 0.4, "law": "tabulated", **CURVE})
     assert table.stress(CURVE["strain"]) / 1e6 == pytest.approx(CURVE["stress_MPa"])
-    doubled = {"poisson_ratio": 0.4, "law": "tabulated", **CURVE}
-    doubled["young_modulus_MPa"] = 2 * table.young_modulus / 1e6
-    assert given_material(doubled).stress(strain) == pytest.approx(2 * table.stress(strain))
+    scaled_curve = {"poisson_ratio": 0.4, "law": "tabulated", **CURVE}
+    scaled_curve["young_modulus_MPa"] = 2 * table.young_modulus / 1e6
+    assert given_material(scaled_curve).stress(strain) == pytest.approx(2 * table.stress(strain))
 
 
 def test_a_base_gives_the_missing_values_and_the_sources():
@@ -46,8 +46,8 @@ def test_a_base_gives_the_missing_values_and_the_sources():
     assert (stiffer.young_modulus, stiffer.poisson_ratio) == (900e6, base.poisson_ratio)
     assert stiffer.law == base.law and stiffer.name == "polyethylene (changed)"
     assert any("Halloran" in source for source in stiffer.sources)
-    straight = given_material({"base": "polyethylene", "law": "linear"})
-    assert isinstance(straight.law, LinearElastic)
+    linear = given_material({"base": "polyethylene", "law": "linear"})
+    assert isinstance(linear.law, LinearElastic)
     record = material_as_json(stiffer)
     assert (record["young_modulus_MPa"], record["law"]) == (900.0, "ramberg-osgood")
 
@@ -75,6 +75,7 @@ def test_an_impossible_material_is_refused(table, words):
 
 @pytest.fixture(scope="module")
 def soft(tmp_path_factory):
+    """Return the path of a material file."""
     path = tmp_path_factory.mktemp("material") / "soft.toml"
     text = 'young_modulus_MPa = 300.0\npoisson_ratio = 0.45\nsources = ["measured here"]\n'
     path.write_text(text, encoding="utf-8")
@@ -85,25 +86,25 @@ def test_press_accepts_a_file_a_name_or_a_material_and_reports_it(soft, capsys):
     command = ["press", str(FEMORAL), str(INSERT), "--load", "1500", "--pose"]
     command += [*map(str, POSE), "--contact", "foundation-linear", "--resolution", "3", "--json"]
     assert main([*command, "--material", str(soft)]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["material"]["young_modulus_MPa"] == 300.0
-    assert found["material"]["sources"] == ["measured here"]
-    assert found["known_error"] == "not measured"
-    given = {"pose": POSE, "contact": "foundation-linear", "resolution_mm": 3.0}
-    again = press_meshes(FEMORAL, INSERT, 1500.0, material=named_material(soft), **given)
-    assert again.result.approach * 1e3 == pytest.approx(found["approach_mm"])
+    output = json.loads(capsys.readouterr().out)
+    assert output["material"]["young_modulus_MPa"] == 300.0
+    assert output["material"]["sources"] == ["measured here"]
+    assert output["known_error"] == "not measured"
+    options = {"pose": POSE, "contact": "foundation-linear", "resolution_mm": 3.0}
+    reference = press_meshes(FEMORAL, INSERT, 1500.0, material=named_material(soft), **options)
+    assert reference.result.approach * 1e3 == pytest.approx(output["approach_mm"])
     # the pressure is E over h times the depth: load and E in the same ratio give the same depth
-    half = press_meshes(
-        FEMORAL, INSERT, 1500.0 * 561.5 / 300.0, material="polyethylene-linear", **given
+    scaled_load = press_meshes(
+        FEMORAL, INSERT, 1500.0 * 561.5 / 300.0, material="polyethylene-linear", **options
     )
-    assert half.result.approach == pytest.approx(again.result.approach, rel=1e-3)
+    assert scaled_load.result.approach == pytest.approx(reference.result.approach, rel=1e-3)
     assert main([*command, "--material", "soft.tml"]) == 2
     assert "no material 'soft.tml'" in capsys.readouterr().err
 
 
 def test_contact_summary_and_wear_use_the_scene_s_material(tmp_path):
-    own = {"young_modulus_MPa": 300.0, "poisson_ratio": 0.45, "yield_stress_MPa": 12.0}
-    changes = {f"material__{key}": value for key, value in own.items()}
+    scene_values = {"young_modulus_MPa": 300.0, "poisson_ratio": 0.45, "yield_stress_MPa": 12.0}
+    changes = {f"material__{key}": value for key, value in scene_values.items()}
     path = write_scene(
         tmp_path,
         contact__material=None,
@@ -147,28 +148,28 @@ def test_contradicting_declarations_are_refused(tmp_path, changes, words):
 
 def test_materials_change_the_identity_of_a_run_and_wear_keys_do_not(tmp_path):
     plain = load_scene(write_scene(tmp_path / "a"))
-    worn = load_scene(write_scene(tmp_path / "b", wear__close="as recorded"))
+    with_wear = load_scene(write_scene(tmp_path / "b", wear__close="as recorded"))
     other = load_scene(
         write_scene(tmp_path / "c", contact__material=None, material__base="polyethylene-linear")
     )
     texts = [
-        one.identity_json.replace(str(tmp_path / name), "")
-        for one, name in ((plain, "a"), (worn, "b"), (other, "c"))
+        loaded.identity_json.replace(str(tmp_path / name), "")
+        for loaded, name in ((plain, "a"), (with_wear, "b"), (other, "c"))
     ]
     assert texts[0] == texts[1] != texts[2]
 
 
-def test_an_override_of_the_material_replaces_what_the_scene_gives():
-    scene = MODEL / "scene.toml"  # names [contact] material and [output] yield_stress_MPa
-    own = load_scene(scene, {"material.base": "polyethylene", "material.yield_stress_MPa": 25.0})
-    assert own.material is not None and own.material.yield_stress_MPa == 25.0
-    whole = load_scene(scene, {"material": {"base": "polyethylene", "young_modulus_MPa": 900.0}})
-    assert given_material(whole.insert_material).young_modulus == pytest.approx(900e6)
+def test_an_override_of_the_material_replaces_the_material_of_the_scene():
+    path = MODEL / "scene.toml"  # names [contact] material and [output] yield_stress_MPa
+    scene = load_scene(path, {"material.base": "polyethylene", "material.yield_stress_MPa": 25.0})
+    assert scene.material is not None and scene.material.yield_stress_MPa == 25.0
+    scene = load_scene(path, {"material": {"base": "polyethylene", "young_modulus_MPa": 900.0}})
+    assert given_material(scene.insert_material).young_modulus == pytest.approx(900e6)
     with pytest.raises(InputError, match="two materials"):
-        load_scene(scene, {"material.base": "polyethylene", "contact.material": "polyethylene"})
+        load_scene(path, {"material.base": "polyethylene", "contact.material": "polyethylene"})
 
 
 def test_an_override_by_a_built_in_name_replaces_the_scene_s_own_material(tmp_path):
-    own = write_scene(tmp_path, contact__material=None, material__base="polyethylene")
-    named = load_scene(own, {"contact.material": "polyethylene-linear"})
+    path = write_scene(tmp_path, contact__material=None, material__base="polyethylene")
+    named = load_scene(path, {"contact.material": "polyethylene-linear"})
     assert named.material is None and named.contact.material == "polyethylene-linear"

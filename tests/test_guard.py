@@ -52,18 +52,18 @@ def shell(command, cwd):
     ],
 )
 def test_closed_and_full_streams_give_at_most_one_line(tmp_path, command, status, lines):
-    ended, _, said = shell(command, tmp_path)
-    assert ended == status, said
-    assert said.count("\n") == lines and "Traceback" not in said, said
-    assert "\x1b" not in said
+    exit_status, _, output = shell(command, tmp_path)
+    assert exit_status == status, output
+    assert output.count("\n") == lines and "Traceback" not in output, output
+    assert "\x1b" not in output
     assert not list(tmp_path.iterdir())
 
 
 def test_control_characters_in_names_are_escaped(tmp_path):
     name = tmp_path / "a\x1b[31m\x9b1m\u202e.stl"
     shutil.copy(MESHES[1], name)
-    ended, printed, _ = shell("TKAMB mesh check *.stl", tmp_path)
-    assert ended == 0 and "a\\u001b[31m\\u009b1m\\u202e.stl" in printed
+    exit_status, printed, _ = shell("TKAMB mesh check *.stl", tmp_path)
+    assert exit_status == 0 and "a\\u001b[31m\\u009b1m\\u202e.stl" in printed
     assert printed.replace("\n", "").isprintable()
     assert printable("3\u00a0°\t\n") == "3\u00a0°\t\n"
     assert json.loads(f'"{printable(chr(0x9B) + chr(0x7F))}"') == "\x9b\x7f"
@@ -73,8 +73,8 @@ def test_a_load_that_is_not_carried_is_reported_on_standard_error(capfd, monkeyp
     monkeypatch.setattr(PressReport, "carried", False)
     line = ["press", *MESHES, "--load", "10", "--resolution", "9", "--contact", "foundation"]
     assert main(line) == 1
-    printed, said = capfd.readouterr()
-    assert printed and said.count("\n") == 1 and "not carried" in said
+    printed, output = capfd.readouterr()
+    assert printed and output.count("\n") == 1 and "not carried" in output
 
 
 def test_an_interrupt_during_the_imports_is_one_line(monkeypatch, capsys):
@@ -87,15 +87,16 @@ def test_an_interrupt_during_the_imports_is_one_line(monkeypatch, capsys):
     monkeypatch.delitem(sys.modules, "tkamb.cli")
     monkeypatch.setattr(sys, "meta_path", [Interrupted(), *sys.meta_path])
     assert tkamb.__main__.main() == 130
-    said = capsys.readouterr().err
-    assert said.startswith("tkamb: interrupted") and said.count("\n") == 1
+    output = capsys.readouterr().err
+    assert output.startswith("tkamb: interrupted") and output.count("\n") == 1
 
 
 def refused(capfd, *arguments):
+    """Return the message of a command that must end with status 2 and one line."""
     assert main([str(argument) for argument in arguments]) == 2
-    said = capfd.readouterr().err
-    assert said.count("\n") == 1 and said.startswith("tkamb: ")
-    return said
+    output = capfd.readouterr().err
+    assert output.count("\n") == 1 and output.startswith("tkamb: ")
+    return output
 
 
 @pytest.mark.parametrize("kind", ["fifo", "device", "folder", "socketless link", "nul", "long"])
@@ -200,17 +201,17 @@ def test_an_unexpected_error_is_one_line_and_a_log(tmp_path, monkeypatch, capfd,
     monkeypatch.setattr("tkamb.run.simulation.load_case", fails)
     scene = write_scene(tmp_path / "scene", ("contact",))
     assert main(["run", str(scene), "--out", str(tmp_path / "out")]) == 1
-    said = capfd.readouterr().err
-    assert said.count("\n") == 1 and words in said
+    output = capfd.readouterr().err
+    assert output.count("\n") == 1 and words in output
     (log,) = (tmp_path / "out").glob("tkamb-error-*.log")
-    assert str(log) in said
+    assert str(log) in output
     assert "Traceback" in log.read_text() and "load_case" in log.read_text()
 
 
-def test_version(capsys):
-    with pytest.raises(SystemExit) as ended:
+def test_version_prints_the_name_and_ends_with_status_0(capsys):
+    with pytest.raises(SystemExit) as exit_status:
         main(["--version"])
-    assert ended.value.code == 0
+    assert exit_status.value.code == 0
     assert capsys.readouterr().out.startswith("tkamb ")
 
 

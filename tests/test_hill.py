@@ -60,15 +60,15 @@ def test_a_path_shorter_than_the_tendon_is_slack_and_too_long_fibres_give_nan():
     assert np.isnan(active[2, 0]) and np.isnan(passive[2, 0])
 
 
-def test_the_curves_are_opensims():
+def test_the_curves_agree_with_opensim():
     peer = pytest.importorskip("opensim", reason="the package opensim is not installed")
     peer.Logger.removeFileSink()
     curves = peer.DeGrooteFregly2016Muscle()
     lengths, speeds = np.linspace(0.4, 1.7, 14), np.linspace(-1.0, 1.0, 11)
-    theirs = [curves.calcActiveForceLengthMultiplier(float(x)) for x in lengths]
-    np.testing.assert_allclose(active_force_length(lengths), theirs, atol=1e-12)
-    theirs = [curves.calcForceVelocityMultiplier(float(v)) for v in speeds]
-    np.testing.assert_allclose(force_velocity(speeds), np.maximum(theirs, 0.0), atol=1e-12)
+    peer_values = [curves.calcActiveForceLengthMultiplier(float(x)) for x in lengths]
+    np.testing.assert_allclose(active_force_length(lengths), peer_values, atol=1e-12)
+    peer_values = [curves.calcForceVelocityMultiplier(float(v)) for v in speeds]
+    np.testing.assert_allclose(force_velocity(speeds), np.maximum(peer_values, 0.0), atol=1e-12)
     # OpenSim's passive curve begins at 0.2 optimal lengths, and has 0.02 at the optimal length
-    theirs = [curves.calcPassiveForceMultiplier(float(x)) for x in lengths]
-    np.testing.assert_allclose(passive_force_length(lengths), theirs, atol=0.02)
+    peer_values = [curves.calcPassiveForceMultiplier(float(x)) for x in lengths]
+    np.testing.assert_allclose(passive_force_length(lengths), peer_values, atol=0.02)

@@ -139,8 +139,8 @@ def test_a_full_disk_is_one_line(capfd):
         raise OSError(errno.ENOSPC, "No space left on device", "results.csv")
 
     assert guarded(command, argparse.Namespace()) == 1
-    said = capfd.readouterr().err
-    assert said.count("\n") == 1 and "results.csv: cannot be written" in said
+    output = capfd.readouterr().err
+    assert output.count("\n") == 1 and "results.csv: cannot be written" in output
 
 
 def test_a_worker_ends_silently_with_its_parent():

@@ -26,11 +26,13 @@ def cached_meshes():
 
 @pytest.fixture(scope="module")
 def knee(cached_meshes, tmp_path_factory):
+    """Return the bench of the shipped knee."""
     return shipped_bench(tmp_path_factory.mktemp("knee"))
 
 
 @pytest.fixture(scope="module")
 def dm(cached_meshes, tmp_path_factory):
+    """Return the bench of subject DM."""
     return dm_bench(tmp_path_factory.mktemp("dm"))
 
 
@@ -62,12 +64,12 @@ def cells(name, column, change, row=None):
     return edit
 
 
-def both(*edits):
+def series(*edits):
     """Return an edit that applies several edits."""
 
     def edit(content, texts):
-        for one in edits:
-            one(content, texts)
+        for part in edits:
+            part(content, texts)
 
     return edit
 
@@ -90,12 +92,12 @@ REFUSED = {
     "inner mass": (urdf('<link name="knee_ml_link"/>',
                         f'<link name="knee_ml_link">{MASS}</inertial></link>'),
                    "link 'knee_ml_link' has a mass"),
-    "order": (both(urdf('"knee_axial_rotation" type', '"spare" type'),
-                   urdf('"knee_adduction" type', '"knee_axial_rotation" type'),
-                   urdf('"spare" type', '"knee_adduction" type'),
-                   urdf('xyz="0 -1 0"', 'xyz="spare"'),
-                   urdf('xyz="-1 0 0"', 'xyz="0 -1 0"'),
-                   urdf('xyz="spare"', 'xyz="-1 0 0"')),
+    "order": (series(urdf('"knee_axial_rotation" type', '"spare" type'),
+                     urdf('"knee_adduction" type', '"knee_axial_rotation" type'),
+                     urdf('"spare" type', '"knee_adduction" type'),
+                     urdf('xyz="0 -1 0"', 'xyz="spare"'),
+                     urdf('xyz="-1 0 0"', 'xyz="0 -1 0"'),
+                     urdf('xyz="spare"', 'xyz="-1 0 0"')),
               "has parent .*the order is tibia, knee_ap, knee_si, knee_ml, knee_axial_rotation"),
     "hip on patella": (urdf('<parent link="femur"/><child link="hip"/>',
                             '<parent link="patella"/><child link="hip"/>'),
@@ -129,17 +131,18 @@ REFUSED = {
     "height in m": (key("patient.height_mm", 1.75),
                     "not within 1000 to 2300; give the standing height in milli"),
     "femur too low": (key("implant.femoral.position_mm", [0.0, -8.0, 0.0]), "is near the insert"),
-    "strain in per cent": (both(key("ligament.0.slack_length_mm", None),
-                                key("ligament.0.reference_strain", 2.0)), "a strain, not per cent"),
-    "exchanged meshes": (both(key("implant.femoral.mesh", str(MODEL / "insert.stl")),
-                              key("implant.insert.mesh", str(MODEL / "femoral_component.stl"))),
+    "strain in per cent": (series(key("ligament.0.slack_length_mm", None),
+                                  key("ligament.0.reference_strain", 2.0)),
+                           "a strain, not per cent"),
+    "exchanged meshes": (series(key("implant.femoral.mesh", str(MODEL / "insert.stl")),
+                                key("implant.insert.mesh", str(MODEL / "femoral_component.stl"))),
                          "are exchanged"),
     "side": (key("patient.side", "left"), "correct .* side, which is 'left'"),
     "left-handed": (key("ground_reaction.laboratory_axes", "+x,+y,-z"), "left-handed"),
     "left-handed mesh": (key("implant.femoral.axes", "+x,+y,-z"), "left-handed"),
-    "unknown key": (both(key("motion.length_unit", None), key("motion.lenght_unit", "mm")),
+    "unknown key": (series(key("motion.length_unit", None), key("motion.lenght_unit", "mm")),
                     "unknown key 'motion.lenght_unit'; did you mean length_unit"),
-    "unknown table": (both(key("motin", {}), key("motion", None)),
+    "unknown table": (series(key("motin", {}), key("motion", None)),
                       "unknown key 'motin'; did you mean motion"),
     "key of another table": (key("contact.mass_kg", 75.0), r"'mass_kg' is a key of \[patient\]"),
     "model": (key("contact.model", "latice"), "did you mean lattice"),
@@ -152,7 +155,7 @@ REFUSED = {
 
 FLAGGED = {
     "centre in metres": (
-        both(*(cells("ground_reaction.csv", f"point_{a}_mm", lambda v: 1e-3 * v) for a in "xyz")),
+        series(*(cells("ground_reaction.csv", f"point_{a}_mm", lambda v: 1e-3 * v) for a in "xyz")),
         "is it in centimetres or metres?"),
     "centre's sign": (cells("ground_reaction.csv", "point_x_mm", lambda v: -v),
                       "mm behind the ankle.*not under the foot.*is its sign"),
@@ -160,7 +163,7 @@ FLAGGED = {
                         "is point_mm in metres?"),
     "pounds": (key("patient.mass_kg", 165.3), "pounds?"),
     "body weights": (
-        both(*(cells("ground_reaction.csv", f"force_{a}_N", lambda v: v / 736) for a in "xyz")),
+        series(*(cells("ground_reaction.csv", f"force_{a}_N", lambda v: v / 736) for a in "xyz")),
         "is it in body weights"),
     "radians": (cells("motion.csv", "flexion_deg", np.deg2rad), "flexion runs .*in radians?"),
     "slack length": (key("ligament.0.slack_length_mm", 70.0), "would strain beyond"),
@@ -174,7 +177,7 @@ FLAGGED = {
     "insertion in centimetres": (key("quadriceps.insertion.point_mm", [0.8, 2.0, 0.0]),
                                  "# mm above the patellar ligament's"),
     "patella in centimetres": (
-        both(*(cells("motion.csv", f"patella_{a}_mm", lambda v: v / 10) for a in ("ap", "si"))),
+        series(*(cells("motion.csv", f"patella_{a}_mm", lambda v: v / 10) for a in ("ap", "si"))),
         "patella lies # to # mm from the flexion axis"),
     "origin behind the femur": (key("quadriceps.origin.point_mm", [-32.0, 205.0, 0.0]),
                                 "quadriceps. origin: no such line ends there"),
@@ -202,7 +205,7 @@ def test_an_unlikely_input_is_flagged_in_its_frames(knee, name):
     outcome = knee.outcome(edit)
     assert not outcome.refused
     assert any(re.search(words, word) for word in outcome.words), outcome.words
-    if name not in ("one sample", "lean's sign"):  # of frames before and after
+    if name not in ("one sample", "lean's sign"):  # these do not affect all frames
         assert {word.partition(":")[0] for word in outcome.words} >= {"0", "2", "4"}
 
 
@@ -212,13 +215,14 @@ def test_the_shipped_knee_raises_no_question(knee):
 
 
 def assert_none_passes(bench, rng, counts):
-    silent = []
+    """Assert that random mistakes are noticed or leave all forces unchanged."""
+    silent_mistakes = []
     for name, edit in random_mistakes(bench, rng, *counts):
         outcome = bench.outcome(edit)
         assert "\n" not in outcome.refused
         if not outcome.notices(bench.untouched) and not outcome.same(bench.untouched):
-            silent.append(name)
-    assert not silent
+            silent_mistakes.append(name)
+    assert not silent_mistakes
 
 
 def test_no_random_mistake_is_silent(knee):
@@ -242,11 +246,11 @@ def turned_axes():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("part", ["femoral", "insert", "patella"])
-def test_a_part_turned_any_other_way_is_noticed(knee, part):
+def test_a_part_with_any_other_axes_is_noticed(knee, part):
     ways = [axes for axes in turned_axes() if part != "patella" or not axes.startswith("+x")]
     assert len(ways) == (20 if part == "patella" else 23)  # a dome may be turned about its axis
     outcomes = {axes: knee.outcome(key(f"implant.{part}.axes", axes)) for axes in ways}
-    assert [axes for axes, found in outcomes.items() if not found.notices(knee.untouched)] == []
+    assert [axes for axes, result in outcomes.items() if not result.notices(knee.untouched)] == []
 
 
 @pytest.mark.slow
@@ -266,9 +270,9 @@ def test_a_question_is_on_stderr_in_summary_report_and_status(tmp_path, capfd):
     scene = write_scene(tmp_path / "scene", ("contact", "ligament"), patient__mass_kg=165.3)
     out = tmp_path / "out"
     assert main(["run", str(scene), "--out", str(out), "--frames", "0:100:50"]) == 0
-    said = capfd.readouterr().err
-    assert "tkamb: question: " in said
-    assert "in pounds?" in said
+    output = capfd.readouterr().err
+    assert "tkamb: question: " in output
+    assert "in pounds?" in output
     summary = json.loads((out / "summary.json").read_text())
     assert any("in pounds?" in question for question in summary["questions"])
     assert summary["flagged_frames"] == 2

@@ -25,6 +25,7 @@ COMMANDS = {
 
 
 def content(folder):
+    """Return name -> bytes of all files below a folder."""
     return {path.name: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
@@ -43,7 +44,7 @@ def test_a_command_does_not_change_the_folder_of_another_command(
     words = [word.format(cohort=cohort) for word in COMMANDS[command]]
     assert main([*words, "--out", str(out)]) == 2
     error = capsys.readouterr().err
-    (line,) = [one for one in error.splitlines() if one.startswith("tkamb: ")]
+    (line,) = [text for text in error.splitlines() if text.startswith("tkamb: ")]
     assert f"holds what `tkamb {occupant}` wrote ({WRITTEN[occupant][0]})" in line
     assert "choose another folder with --out" in line
     assert content(out) == before

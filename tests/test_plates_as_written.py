@@ -72,13 +72,13 @@ def test_a_unit_word_has_its_factor_to_si(word, read, value):
     assert read(word) == (None if value is None else pytest.approx(value))
 
 
-@pytest.mark.parametrize("given", ["moment", "both"])
-def test_an_unknown_unit_word_needs_the_option_of_the_unit(tmp_path, given):
-    force = "N" if given == "moment" else "kiloponds?"
+@pytest.mark.parametrize("option", ["moment", "both"])
+def test_an_unknown_unit_word_needs_the_option_of_the_unit(tmp_path, option):
+    force = "N" if option == "moment" else "kiloponds?"
     path = recorded(tmp_path, units=[force] * 3 + ["huh"] * 3)
     with pytest.raises(InputError, match=r"'(huh|kiloponds\?)'.*--(force|moment)-unit"):
         read_c3d(path).plate(1)
-    units = GivenUnits(force="N" if given == "both" else None, moment="Nmm")
+    units = GivenUnits(force="N" if option == "both" else None, moment="Nmm")
     np.testing.assert_allclose(read_c3d(path, units).plates[0].wrench, wrench(), atol=1e-3)
     with pytest.raises(InputError, match="correct moment_unit"):
         read_c3d(recorded(tmp_path), GivenUnits(moment="Nm")).plate(1)
@@ -110,8 +110,8 @@ def test_a_calibration_gives_moments_in_the_unit_of_length(tmp_path, unit, kind)
     path = recorded(
         tmp_path, kind, ["V"] * channels, volts, point_unit=unit, plate=scaled(plate, unit)
     )
-    found = read_c3d(path).plates[0].wrench
-    np.testing.assert_allclose(found, wrench(), atol=5e-3)  # single precision, times the matrix
+    result = read_c3d(path).plates[0].wrench
+    np.testing.assert_allclose(result, wrench(), atol=5e-3)  # single precision, times the matrix
 
 
 def scaled(plate, unit):
@@ -167,24 +167,24 @@ def with_zero(path, zero):
     """Write FORCE_PLATFORM:ZERO into a file."""
     import ezc3d
 
-    whole = ezc3d.c3d(str(path))
-    first = whole["header"]["points"]["first_frame"]
-    whole.add_parameter("FORCE_PLATFORM", "ZERO", zero)
-    whole["header"]["points"]["first_frame"] = first
-    whole.write(str(path))
+    file = ezc3d.c3d(str(path))
+    first = file["header"]["points"]["first_frame"]
+    file.add_parameter("FORCE_PLATFORM", "ZERO", zero)
+    file["header"]["points"]["first_frame"] = first
+    file.write(str(path))
     return path
 
 
 def two_plates(folder, level):
     """Write two drifting plates, with a foot on plate 1 from frame 6."""
     clean, _ = offset_signals()
-    beside = np.zeros_like(clean)
-    signals = np.concatenate([clean, beside])
+    unloaded = np.zeros_like(clean)
+    signals = np.concatenate([clean, unloaded])
     signals[[2, 8]] += level
-    far = AMTI_CORNERS + np.array([1.5, 0.0, 0.0])
+    distant_corners = AMTI_CORNERS + np.array([1.5, 0.0, 0.0])
     plates = [
         {"type": 2, "channels": range(1, 7), "origin": ORIGIN},
-        {"type": 2, "channels": range(7, 13), "corners": far},
+        {"type": 2, "channels": range(7, 13), "corners": distant_corners},
     ]
     return write_c3d(
         folder / "two.c3d",
@@ -212,7 +212,7 @@ def test_an_unloaded_plate_is_left_out_of_the_sum_and_its_drift_is_reported(tmp_
     expected = {} if level == 0 else {2: level}  # plate 1 is unloaded for too short a time
     assert ground.drift == pytest.approx(expected, abs=1e-3)
     case = type("Case", (), {"ground": ground})
-    questions = [str(one.text) for one in drift_questions(case)]
+    questions = [str(question.text) for question in drift_questions(case)]
     assert len(questions) == (level != 0) and all("set to zero" in text for text in questions)
 
 
@@ -280,9 +280,9 @@ def test_equal_labels_are_refused_only_if_they_are_needed(tmp_path, name):
 
     markers = standing_markers() | {"x": np.ones((20, 3)), "y": 2 * np.ones((20, 3))}
     path = write_c3d(tmp_path / "a.c3d", markers)
-    whole = ezc3d.c3d(str(path))
-    whole["parameters"]["POINT"]["LABELS"]["value"] = [*list(markers)[:3], name, name]
-    whole.write(str(path))
+    file = ezc3d.c3d(str(path))
+    file["parameters"]["POINT"]["LABELS"]["value"] = [*list(markers)[:3], name, name]
+    file.write(str(path))
     table = read_table(path)
     heel = marker_trajectories(table, ["RHeel"], 1.0)
     np.testing.assert_allclose(heel[:, 0], markers["JW:RHeel"], atol=1e-6)
@@ -298,9 +298,9 @@ def test_equal_channels_are_refused_only_if_they_are_needed(tmp_path):
     time = np.arange(200) / 1000.0
     signals = {f"c{k}": np.sin(k + 9 * time) for k in range(3)}
     path = write_c3d(tmp_path / "a.c3d", standing_markers(), analog=signals, units=["V"] * 3)
-    whole = ezc3d.c3d(str(path))
-    whole["parameters"]["ANALOG"]["LABELS"]["value"] = ["soleus", "free", "free"]
-    whole.write(str(path))
+    file = ezc3d.c3d(str(path))
+    file["parameters"]["ANALOG"]["LABELS"]["value"] = ["soleus", "free", "free"]
+    file.write(str(path))
     recording = read_c3d(path)
     np.testing.assert_allclose(recording.channel("soleus"), signals["c0"], atol=1e-6)
     with pytest.raises(InputError, match="two channels 'free'"):

@@ -59,6 +59,7 @@ def two_condyles():
 
 
 def dishes():
+    """Return an insert with two dishes."""
     return dished_insert(
         lambda x, z: 8e-3 + (x**2) / (2 * 50e-3) + (np.abs(z) - 22e-3) ** 2 / (2 * 60e-3),
         half_x=20e-3,
@@ -90,9 +91,10 @@ def meshes(tmp_path_factory):
 
 
 def condyles(report):
-    found = report.as_dict()
+    """Return the results of medial and lateral condyle, one row each (2, 7)."""
+    output = report.as_dict()
     return np.array(
-        [[*(found[s][k] for k in CONDYLE_KEYS[:-1]), *found[s]["cop_mm"]] for s in SIDES]
+        [[*(output[s][k] for k in CONDYLE_KEYS[:-1]), *output[s]["cop_mm"]] for s in SIDES]
     )
 
 
@@ -103,16 +105,16 @@ def test_the_json_output_has_the_documented_keys(meshes, capsys):
     femoral, insert = meshes()
     arguments = ["press", str(femoral), str(insert), "--load", "900", "--json"]
     assert main([*arguments, *FOUNDATION, "--resolution", "1.5"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert list(found) == KEYS
-    assert list(found["medial"]) == list(found["lateral"]) == CONDYLE_KEYS
-    assert found["status"] == "ok"
-    assert found["load_N"] == 900
-    assert found["reaction_N"] == pytest.approx(900, rel=1e-6)
-    assert found["resolution_mm"] == 1.5
-    assert found["medial"]["cop_mm"][2] == pytest.approx(-22, abs=1.5)
-    assert found["lateral"]["cop_mm"][2] == pytest.approx(22, abs=1.5)
-    assert 0 < found["approach_mm"] < 1
+    output = json.loads(capsys.readouterr().out)
+    assert list(output) == KEYS
+    assert list(output["medial"]) == list(output["lateral"]) == CONDYLE_KEYS
+    assert output["status"] == "ok"
+    assert output["load_N"] == 900
+    assert output["reaction_N"] == pytest.approx(900, rel=1e-6)
+    assert output["resolution_mm"] == 1.5
+    assert output["medial"]["cop_mm"][2] == pytest.approx(-22, abs=1.5)
+    assert output["lateral"]["cop_mm"][2] == pytest.approx(22, abs=1.5)
+    assert 0 < output["approach_mm"] < 1
 
 
 def test_the_text_has_both_condyles_and_the_map_has_the_load(meshes, capsys, tmp_path):
@@ -132,9 +134,9 @@ def test_the_lattice_is_the_default(meshes, capsys, tmp_path, monkeypatch):
     femoral, insert = meshes()
     arguments = ["press", str(femoral), str(insert), "--load", "900", "--no-cache", "--json"]
     assert main([*arguments, "--resolution", "2"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["contact"] == "lattice"
-    assert found["reaction_N"] == pytest.approx(900, rel=1e-5)
+    output = json.loads(capsys.readouterr().out)
+    assert output["contact"] == "lattice"
+    assert output["reaction_N"] == pytest.approx(900, rel=1e-5)
     assert not (tmp_path / "cache").exists()
     assert main([*arguments, *FOUNDATION]) == 2
     assert "'foundation' has no cache on disk" in capsys.readouterr().err
@@ -178,12 +180,12 @@ def test_a_left_knee_is_the_mirror_image(meshes):
 def nodal_forces(path):
     """Return the nodal forces (n, 3), N, of a .vtp file."""
     arrays = ElementTree.parse(path).getroot().iter("DataArray")
-    (text,) = (one.text for one in arrays if one.get("Name") == "nodal_force_N")
+    (text,) = (array.text for array in arrays if array.get("Name") == "nodal_force_N")
     return np.frombuffer(base64.b64decode(text)[8:]).reshape(-1, 3)
 
 
 def test_the_map_of_a_left_knee_is_on_the_given_insert(meshes, tmp_path):
-    """Its centres of pressure are the printed ones, and it mirrors the map of the right knee."""
+    """The map has the printed centres of pressure, and mirrors the map of the right knee."""
     pose, path, forces = np.array([2.0, 30.0, 0.4, 0.03, 1.0, 15.0]), tmp_path / "map.vtp", {}
     for side, flip in (("right", 1), ("left", -1)):
         turned = pose * [1, 1, flip, flip, flip, 1]
@@ -210,7 +212,7 @@ def test_the_pose_is_that_of_the_femoral_mesh_in_the_insert_s_axes(meshes):
 
 
 def test_the_adjustment_removes_a_recorded_varus_of_0_2_deg(meshes, capsys):
-    """It is within the error of fluoroscopy."""
+    """Such a varus is within the error of fluoroscopy."""
     level = press_meshes(*meshes(), 2000.0).result
     centre = level.pose[1, 3] * 1e3 + level.approach * 1e3
     report = press_meshes(*meshes(), 2000.0, pose=(0, centre + 0.05, 0, 0.2, 0, 0), adjust=True)
@@ -230,13 +232,13 @@ def test_the_adjusted_split_does_not_depend_on_the_recorded_height(height, moved
     files = [str(KNEE / name) for name in ("femoral_component.stl", "insert.stl")]
     pose = ["--pose", "-6.9", str(height), "0", "0.3", "0", "0"]
     assert main(["press", *files, "--load", "1500", *pose, *FOUNDATION, "--adjust", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["medial"]["force_N"] == pytest.approx(748, abs=3)
-    assert found["lateral"]["force_N"] == pytest.approx(752.5, abs=3)
-    assert found["adjustment"]["translation_mm"] == pytest.approx(moved, abs=0.01)
-    assert found["adjustment"]["coronal_deg"] == pytest.approx(-0.3, abs=0.01)
-    assert not found["adjustment"]["restored"]
-    assert found["flags"] == []
+    output = json.loads(capsys.readouterr().out)
+    assert output["medial"]["force_N"] == pytest.approx(748, abs=3)
+    assert output["lateral"]["force_N"] == pytest.approx(752.5, abs=3)
+    assert output["adjustment"]["translation_mm"] == pytest.approx(moved, abs=0.01)
+    assert output["adjustment"]["coronal_deg"] == pytest.approx(-0.3, abs=0.01)
+    assert not output["adjustment"]["restored"]
+    assert output["flags"] == []
 
 
 def test_the_rule_either_restores_the_rotation_at_the_right_height(meshes):
@@ -258,11 +260,11 @@ def test_the_contact_of_a_single_sphere_is_medial(tmp_path):
     graded_sphere(20e-3).mesh.export(tmp_path / "sphere.ply")
     flat_insert(10e-3).mesh.export(tmp_path / "block.ply")
     report = press_meshes(tmp_path / "sphere.ply", tmp_path / "block.ply", 500.0, units="m")
-    found = report.as_dict()
-    assert found["lateral"] is None
-    assert found["medial"]["force_N"] == pytest.approx(500, rel=1e-6)
-    assert found["medial"]["cop_mm"] == pytest.approx([0, 10, 0], abs=0.02)
-    assert any("one condyle: its contact is called medial" in flag for flag in found["flags"])
+    output = report.as_dict()
+    assert output["lateral"] is None
+    assert output["medial"]["force_N"] == pytest.approx(500, rel=1e-6)
+    assert output["medial"]["cop_mm"] == pytest.approx([0, 10, 0], abs=0.02)
+    assert any("one condyle: its contact is called medial" in flag for flag in output["flags"])
 
 
 @pytest.mark.parametrize(("turn", "noted"), [(20, False), (-45, True), (90, True), (180, True)])
@@ -304,12 +306,12 @@ def test_a_zero_load_is_ok_and_too_large_a_load_is_out_of_range(meshes):
     assert unloaded["medial"] is None
     assert unloaded["status"] == "ok"
     crushed = press_meshes(*meshes(), 1e5)
-    found = crushed.as_dict()
-    assert found["status"] == "out_of_range"
-    assert found["reaction_N"] is found["approach_mm"] is found["medial"] is None
+    output = crushed.as_dict()
+    assert output["status"] == "out_of_range"
+    assert output["reaction_N"] is output["approach_mm"] is output["medial"] is None
     assert not crushed.carried
     assert any("cannot be reached" in line for line in crushed.lines())
-    json.dumps(found, allow_nan=False)
+    json.dumps(output, allow_nan=False)
 
 
 @pytest.mark.parametrize(
@@ -344,9 +346,11 @@ def test_bad_input_is_refused(meshes, changed, words):
 
 def test_an_open_insert_is_refused(meshes, tmp_path):
     femoral, _ = meshes()
-    whole = dishes()
-    keep = whole.face_normals[:, 1] < 0.5
-    Surface(1e3 * whole.vertices, whole.faces[keep], "shell").mesh.export(tmp_path / "shell.ply")
+    surface = dishes()
+    keep = surface.face_normals[:, 1] < 0.5
+    Surface(1e3 * surface.vertices, surface.faces[keep], "shell").mesh.export(
+        tmp_path / "shell.ply"
+    )
     with pytest.raises(InputError, match=r"closed|flat"):
         press_meshes(femoral, tmp_path / "shell.ply", 500.0)
 
@@ -368,7 +372,7 @@ def test_both_condyles_of_subject_dm_are_loaded_in_stance():
     geometry = Path(__file__).parents[2] / "shared" / "data" / "dm" / "geometry"
     if not geometry.is_dir():
         pytest.skip("subject DM's data are not beside the project")
-    found = press_meshes(
+    output = press_meshes(
         geometry / "femoral_component.stl",
         geometry / "tibial_insert.stl",
         1500.0,
@@ -378,9 +382,9 @@ def test_both_condyles_of_subject_dm_are_loaded_in_stance():
         adjust=True,
     ).as_dict()
     for side, sign in (("medial", -1), ("lateral", 1)):
-        assert found[side]["force_N"] > 600.0
-        assert 18.0 < sign * found[side]["cop_mm"][2] < 32.0
-        assert abs(found[side]["cop_mm"][0]) < 8.0
+        assert output[side]["force_N"] > 600.0
+        assert 18.0 < sign * output[side]["cop_mm"][2] < 32.0
+        assert abs(output[side]["cop_mm"][0]) < 8.0
 
 
 def test_press_and_mesh_lattice_accept_every_unit_of_length():

@@ -8,6 +8,7 @@ from tkamb.run.timing import Profile
 
 
 def profiled(folder, drop, capsys, *options):
+    """Return the profile of a run of the shipped scene without the tables in `drop`."""
     scene = write_scene(folder / "scene", drop)
     out = folder / "out"
     run = ["run", str(scene), "--out", str(out), "--frames", "0:101:50", "--profile", "--json"]
@@ -17,13 +18,13 @@ def profiled(folder, drop, capsys, *options):
 
 
 def test_the_profile_has_files_frames_and_times(tmp_path, capsys):
-    found = profiled(tmp_path, (), capsys, "--contact", "foundation")
-    names = {path.rsplit("/", 1)[-1] for path in found["files"]}
+    report = profiled(tmp_path, (), capsys, "--contact", "foundation")
+    names = {path.rsplit("/", 1)[-1] for path in report["files"]}
     assert {"scene.toml", "patient.urdf", "motion.csv", "insert.stl"} <= names
-    assert found["frames"] == 3 and found["not_modelled"] == []
-    parts = {name: seconds for name, seconds in found["seconds"].items() if name != "all"}
+    assert report["frames"] == 3 and report["not_modelled"] == []
+    parts = {name: seconds for name, seconds in report["seconds"].items() if name != "all"}
     assert {"read", "contact", "equations of motion"} <= set(parts)
-    assert abs(sum(parts.values()) - found["seconds"]["all"]) < 1e-6
+    assert abs(sum(parts.values()) - report["seconds"]["all"]) < 1e-6
 
 
 def test_the_profile_lists_files_outside_the_scene_s_folder(tmp_path, capsys):
@@ -33,20 +34,20 @@ def test_the_profile_lists_files_outside_the_scene_s_folder(tmp_path, capsys):
     scene.write_text(scene.read_text().replace('"insert.stl"', '"../elsewhere/insert.stl"'))
     run = ["run", str(scene), "--out", str(out), "--frames", "0:1", "--profile", "--json"]
     assert main([*run, "--contact", "foundation"]) == 0
-    found = json.loads(capsys.readouterr().out)["profile"]["files"]
-    assert str(tmp_path / "elsewhere" / "insert.stl") in found
-    assert len(found) == len(set(found))
-    assert all(path.startswith(str(tmp_path)) for path in found)
+    files = json.loads(capsys.readouterr().out)["profile"]["files"]
+    assert str(tmp_path / "elsewhere" / "insert.stl") in files
+    assert len(files) == len(set(files))
+    assert all(path.startswith(str(tmp_path)) for path in files)
 
 
 def test_a_minimal_scene_reads_only_its_files(tmp_path, capsys):
     muscles = ("quadriceps", "patellar_ligament", "patella")
     drop = ("contact", "implant", "ligament", "tibia", "ground_reaction", *muscles)
-    found = profiled(tmp_path, drop, capsys)
-    names = {path.rsplit("/", 1)[-1] for path in found["files"]}
+    report = profiled(tmp_path, drop, capsys)
+    names = {path.rsplit("/", 1)[-1] for path in report["files"]}
     assert names == {"scene.toml", "patient.urdf", "motion.csv"}
-    assert "contact" not in found["seconds"] and "prepare contact" not in found["seconds"]
-    assert "femorotibial contact" in found["not_modelled"]
+    assert "contact" not in report["seconds"] and "prepare contact" not in report["seconds"]
+    assert "femorotibial contact" in report["not_modelled"]
 
 
 def test_the_profile_lists_only_files_that_are_read(tmp_path):

@@ -68,10 +68,10 @@ def test_the_time_series_for_paraview_has_a_file_for_each_map(tmp_path, capsys):
     assert main(["export", str(tmp_path / "run"), "--vtp", "--out", str(out)]) == 0
     assert "10 of 11 frames" in capsys.readouterr().out
     sets = ElementTree.parse(out / "contact.pvd").getroot().findall("Collection/DataSet")
-    times = [float(one.get("timestep")) for one in sets]
+    times = [float(item.get("timestep")) for item in sets]
     assert times == [t for k, t in enumerate(RUN["time_s"]) if k != 3]
-    for one in sets:
-        _, faces = read_triangles(out / one.get("file"))
+    for item in sets:
+        _, faces = read_triangles(out / item.get("file"))
         np.testing.assert_array_equal(faces, maps.triangles)
 
 
@@ -86,8 +86,8 @@ def test_the_time_series_for_paraview_has_a_file_for_each_map(tmp_path, capsys):
 )
 def test_options_that_do_not_belong_together_are_refused(tmp_path, capsys, arguments, words):
     assert main(["export", str(tmp_path), *arguments]) == 2
-    said = capsys.readouterr().err
-    assert words in said and said.count("\n") == 1
+    output = capsys.readouterr().err
+    assert words in output and output.count("\n") == 1
 
 
 def test_titles_legends_and_plots_do_not_overlap():
@@ -103,14 +103,14 @@ def test_titles_legends_and_plots_do_not_overlap():
         if axes.get_legend()
         for part in (axes._left_title, axes.get_legend(), axes.patch)
     ]
-    for k, one in enumerate(boxes):
-        assert not any(one.overlaps(other) for other in boxes[k + 1 :] if not touches(one, other))
+    for k, item in enumerate(boxes):
+        assert not any(item.overlaps(other) for other in boxes[k + 1 :] if not touches(item, other))
     assert len(boxes) >= 9
 
 
-def touches(one, other):
+def touches(item, other):
     """Return whether two boxes share an edge only."""
-    return min(one.y1, other.y1) - max(one.y0, other.y0) < 0.5
+    return min(item.y1, other.y1) - max(item.y0, other.y0) < 0.5
 
 
 def test_representations_of_reports_results_maps_and_scenes_are_short():
@@ -125,7 +125,7 @@ def test_representations_of_reports_results_maps_and_scenes_are_short():
         contact="foundation",
         resolution_mm=4.0,
     )
-    for one in (report, report.result, RUN.maps, tkamb.load_scene(files / "scene.toml")):
-        assert repr(one).startswith(f"<tkamb.{type(one).__name__}: ")
-        assert len(repr(one)) < 250
+    for item in (report, report.result, RUN.maps, tkamb.load_scene(files / "scene.toml")):
+        assert repr(item).startswith(f"<tkamb.{type(item).__name__}: ")
+        assert len(repr(item)) < 250
     assert f"medial {report.result.medial.force:.0f} N" in repr(report)

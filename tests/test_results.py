@@ -28,26 +28,28 @@ def test_written_and_read_results_are_identical(tmp_path):
     run.columns["force_ap_N"][4] = 5e-324
     run.columns["force_ap_N"][5] = -0.0
     write_results(run, tmp_path)
-    again = read_results(tmp_path)
-    assert list(again.columns) == list(run.columns)
+    copy = read_results(tmp_path)
+    assert list(copy.columns) == list(run.columns)
     for name, values in run.columns.items():
         if name == "status":
-            assert again.status == values
+            assert copy.status == values
         else:
-            assert np.array_equal(again[name], values, equal_nan=True), name
-            assert np.array_equal(np.signbit(again[name]), np.signbit(values)), name
-    assert again.summary == json.loads((tmp_path / "summary.json").read_text())
+            assert np.array_equal(copy[name], values, equal_nan=True), name
+            assert np.array_equal(np.signbit(copy[name]), np.signbit(values)), name
+    assert copy.summary == json.loads((tmp_path / "summary.json").read_text())
     for name in ("points_m", "triangles", "time_s", "pressure_Pa", "gap_m", "nodal_force_N"):
-        assert np.array_equal(getattr(again.maps, name), getattr(run.maps, name)), name
-    assert again.maps.attributes["model"] == "synthetic"
-    assert again.maps.attributes["units"].startswith("SI")
+        assert np.array_equal(getattr(copy.maps, name), getattr(run.maps, name)), name
+    assert copy.maps.attributes["model"] == "synthetic"
+    assert copy.maps.attributes["units"].startswith("SI")
 
 
 def test_columns_have_the_order_of_the_table():
     run = make_run(frames=5, maps=False)
-    fixed = [one.name for one in COLUMNS if "<" not in one.name and not one.optional]
+    names_in_table = [
+        column.name for column in COLUMNS if "<" not in column.name and not column.optional
+    ]
     written = [name for name in run.columns if not is_ligament(name)]
-    assert written == fixed
+    assert written == names_in_table
     ligaments = [name for name in run.columns if is_ligament(name)]
     assert [ligament_of(name) for name in ligaments] == ["PCL_anterolateral", "MCL_anterior"]
     names = list(run.columns)
@@ -63,8 +65,8 @@ def test_a_column_that_is_not_modelled_is_empty():
     assert row["force_total_N"] == ""
     assert row["flexion_deg"] == "60.0"
     assert row["status"] == "singular"
-    absent = sum("<" in column.name or column.optional for column in COLUMNS)
-    assert len(first.split(",")) == len(COLUMNS) - absent
+    absent_count = sum("<" in column.name or column.optional for column in COLUMNS)
+    assert len(first.split(",")) == len(COLUMNS) - absent_count
 
 
 def test_a_column_of_an_earlier_release_is_read_under_its_new_name(tmp_path):

@@ -29,6 +29,7 @@ TOTAL = 20
 
 
 def start(scene, out, *more):
+    """Start a run of 20 frames in another process."""
     command = [sys.executable, "-m", "tkamb.cli", "run", str(scene), "--out", str(out)]
     command += [*more, *FRAMES]
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
@@ -45,7 +46,7 @@ def kill(process):
     process.communicate()
 
 
-def check_whole(out):
+def check_complete(out):
     """Check that every visible file in the folder can be read and is complete."""
     names = {path.name for path in out.iterdir() if not path.name.startswith(".")}
     assert names <= {"results.csv", "summary.json", "contact.h5", "report.html"}
@@ -61,35 +62,37 @@ def check_whole(out):
         assert np.isnan(results["force_si_N"][np.invert(computed)]).all()
 
 
-def check_same(found: Results, undisturbed: Results, tolerance=0.0):
-    assert found.status == undisturbed.status
-    assert list(found.columns) == list(undisturbed.columns)
-    for name in found.columns:
+def check_equal(results: Results, undisturbed: Results, tolerance=0.0):
+    """Assert that two results have equal statuses, columns and pressure maps."""
+    assert results.status == undisturbed.status
+    assert list(results.columns) == list(undisturbed.columns)
+    for name in results.columns:
         if name != "status" and name not in CLOCKS:
             np.testing.assert_allclose(
-                found[name], undisturbed[name], rtol=tolerance, atol=1e-12, err_msg=name
+                results[name], undisturbed[name], rtol=tolerance, atol=1e-12, err_msg=name
             )
     if undisturbed.maps is not None:
         peak = np.nanmax(undisturbed.maps.pressure_Pa)
         np.testing.assert_allclose(
-            found.maps.pressure_Pa, undisturbed.maps.pressure_Pa, atol=tolerance * peak
+            results.maps.pressure_Pa, undisturbed.maps.pressure_Pa, atol=tolerance * peak
         )
 
 
 @pytest.fixture(scope="module")
 def undisturbed():
+    """Return the results of the run without interruption."""
     return simulate(fast_scene(), frames=slice(0, 40, 2))
 
 
 def kill_and_resume(out, waits):
-    """Kill and resume a run for each wait (frames, s); return the final results."""
+    """Kill and resume a run after each wait (number of frames, seconds), and return its results."""
     for count, seconds in waits:
         process = start(fast_scene(), out, "--resume")
         wait_for_frames(process, out, count)
         time.sleep(seconds)
         kill(process)
         if out.exists():
-            check_whole(out)
+            check_complete(out)
     process = start(fast_scene(), out, "--resume")
     assert process.wait(timeout=300) == 0, process.stderr.read()
     process.communicate()
@@ -101,18 +104,18 @@ def kill_and_resume(out, waits):
 def test_a_run_that_is_killed_repeatedly_has_the_results_of_an_undisturbed_run(
     tmp_path, undisturbed
 ):
-    """It is killed at its start, at the first frames, in between and at the end."""
+    """The kills are at the start, at the first frames, in between and at the end."""
     waits = [(0, 0.5), (1, 0.0), (3, 0.01), (8, 0.03), (14, 0.0), (TOTAL, 0.02)]
-    found = kill_and_resume(tmp_path / "out", waits)
-    check_same(found, undisturbed)
-    assert found.summary["resumed_frames"] >= 14
+    results = kill_and_resume(tmp_path / "out", waits)
+    check_equal(results, undisturbed)
+    assert results.summary["resumed_frames"] >= 14
 
 
 @pytest.mark.slow
 def test_a_run_killed_at_random_times_has_the_results_of_an_undisturbed_run(tmp_path, undisturbed):
     chance = random.Random(7)
     moments = [(chance.randrange(1, TOTAL + 1), chance.random() ** 2) for _ in range(20)]
-    check_same(kill_and_resume(tmp_path / "out", sorted(moments)), undisturbed)
+    check_equal(kill_and_resume(tmp_path / "out", sorted(moments)), undisturbed)
 
 
 @pytest.mark.parametrize(
@@ -121,21 +124,21 @@ def test_a_run_killed_at_random_times_has_the_results_of_an_undisturbed_run(tmp_
 def test_a_lattice_depends_on_its_warm_start_within_the_stated_tolerance(workers, stops):
     """The run is interrupted and resumed, with one and two workers."""
     options = {"contact": "lattice", "resolution_mm": 4.0, "frames": slice(20, 44, 2)}
-    whole = simulate(fast_scene(), **options)
-    found = interrupted(fast_scene(), stops, workers=workers, **options)
-    assert max(deviations(found, whole).values()) <= 1.0
-    assert found.summary["resumed_frames"] == sum(stops)
+    reference = simulate(fast_scene(), **options)
+    results = interrupted(fast_scene(), stops, workers=workers, **options)
+    assert max(deviations(results, reference).values()) <= 1.0
+    assert results.summary["resumed_frames"] == sum(stops)
 
 
 @pytest.mark.slow
 def test_a_resumed_run_with_released_coordinates_has_the_same_results(tmp_path):
     scene = write_scene(tmp_path / "scene", contact__released=["adduction"])
     options = {"frames": slice(30, 40, 2)}
-    whole = simulate(scene, **options)
+    reference = simulate(scene, **options)
     out = tmp_path / "out"
     out.mkdir()
     stop_after(out, 3, scene=scene, **options)
-    check_same(simulate(scene, directory=out, resume=True, **options), whole, tolerance=1e-6)
+    check_equal(simulate(scene, directory=out, resume=True, **options), reference, tolerance=1e-6)
 
 
 def stop_after(directory, count, scene=None, **options):
@@ -157,12 +160,12 @@ def test_an_interrupted_run_leaves_readable_results_and_states_their_number(tmp_
     process = start(fast_scene(), out)
     wait_for_frames(process, out, 4)
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=60)
+    _, output = process.communicate(timeout=60)
     assert process.returncode == 130
-    lines = said.decode().strip().splitlines()
+    lines = output.decode().strip().splitlines()
     count = int(re.fullmatch(r"tkamb: interrupted: (\d+) of 20 frames .*--resume", lines[-1])[1])
     assert 4 <= count < TOTAL
-    check_whole(out)
+    check_complete(out)
     results = read_results(out)
     assert len(results.maps) == count
     assert results.summary["unfinished_frames"] == TOTAL - count
@@ -175,8 +178,8 @@ def test_a_run_without_contact_is_resumed(tmp_path):
     out.mkdir()
     stop_after(out, 3, scene=scene, frames=slice(0, 8))
     assert not (out / "contact.h5").exists()
-    found = simulate(scene, frames=slice(0, 8), directory=out, resume=True)
-    check_same(found, simulate(scene, frames=slice(0, 8)))
+    results = simulate(scene, frames=slice(0, 8), directory=out, resume=True)
+    check_equal(results, simulate(scene, frames=slice(0, 8)))
 
 
 @pytest.mark.parametrize(
@@ -204,8 +207,8 @@ def test_a_run_with_a_changed_file_is_not_resumed(tmp_path, capsys):
     motion.write_text(motion.read_text() + "\n")
     command = ["run", str(scene), "--out", str(out), "--frames", "0:8", "--resume"]
     assert main(command) == 2
-    said = capsys.readouterr().err
-    assert "another content of a file" in said and said.count("\n") == 1
+    output = capsys.readouterr().err
+    assert "another content of a file" in output and output.count("\n") == 1
 
 
 def test_a_finished_run_is_not_computed_again(tmp_path, capsys):
@@ -219,8 +222,8 @@ def test_a_finished_run_is_not_computed_again(tmp_path, capsys):
 
 
 def test_resume_in_an_empty_folder_computes_all_frames(tmp_path):
-    found = simulate(fast_scene(), frames=slice(0, 2), directory=tmp_path, resume=True)
-    assert len(found) == 2
+    results = simulate(fast_scene(), frames=slice(0, 2), directory=tmp_path, resume=True)
+    assert len(results) == 2
     with pytest.raises(InputError, match="needs the folder"):
         simulate(fast_scene(), frames=slice(0, 2), resume=True)
 
@@ -228,13 +231,13 @@ def test_resume_in_an_empty_folder_computes_all_frames(tmp_path):
 def test_a_truncated_frame_counts_as_absent(tmp_path):
     shards = Shards(tmp_path, {"scene": "a"}, resume=False)
     shards.put(3, Shard({"time_s": 0.1, "x": float("nan")}, {"pressure": np.arange(4.0)}))
-    found = shards.get(3)
-    assert found.row["time_s"] == 0.1 and np.isnan(found.row["x"])
-    assert np.array_equal(found.contact["pressure"], np.arange(4.0))
+    shard = shards.get(3)
+    assert shard.row["time_s"] == 0.1 and np.isnan(shard.row["x"])
+    assert np.array_equal(shard.contact["pressure"], np.arange(4.0))
     path = next((tmp_path / ".frames").glob("*.frame"))
-    whole = path.read_bytes()
-    for size in (0, 10, 40, len(whole) - 1):
-        path.write_bytes(whole[:size])
+    content = path.read_bytes()
+    for size in (0, 10, 40, len(content) - 1):
+        path.write_bytes(content[:size])
         assert shards.get(3) is None
     assert shards.get(4) is None
 
@@ -258,9 +261,9 @@ def test_a_forged_frame_with_the_right_hash_is_refused(tmp_path):
         with pytest.raises(InputError, match="somebody changed it"):
             simulate(fast_scene(), frames=frames, directory=tmp_path, resume=True)
     (tmp_path / ".frames" / "000001.frame").unlink()
-    found = simulate(fast_scene(), frames=frames, directory=tmp_path, resume=True)
-    assert found.summary["resumed_frames"] == 1
-    assert np.isfinite(found["force_si_N"]).all()
+    results = simulate(fast_scene(), frames=frames, directory=tmp_path, resume=True)
+    assert results.summary["resumed_frames"] == 1
+    assert np.isfinite(results["force_si_N"]).all()
 
 
 def test_an_interrupt_is_delayed_until_a_frame_is_written():

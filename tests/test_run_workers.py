@@ -21,10 +21,12 @@ EFFORT = ("body_seconds", "query_seconds", "contact_seconds", "iterations")
 
 @pytest.fixture(scope="module")
 def serial():
+    """Return the results of a run in one process."""
     return simulate(SCENE, frames=slice(0, 101, 8))
 
 
 def numbers(results):
+    """Return name -> values of the numeric columns."""
     return {name: results[name] for name in results.columns if KINDS.get(name) != "text"}
 
 
@@ -48,24 +50,24 @@ def test_a_bad_number_of_workers_is_refused_before_the_folder_is_created(tmp_pat
 
 
 def test_a_run_with_two_workers_is_resumed_with_one(tmp_path, monkeypatch):
-    stopped = []
+    computed = []
 
     def stop_after(frames):
         for k in frames:
-            if len(stopped) == 11:
+            if len(computed) == 11:
                 raise KeyboardInterrupt
-            stopped.append(k)
+            computed.append(k)
             yield k
 
     out, frames = tmp_path / "out", slice(0, 101, 8)
     with pytest.raises(KeyboardInterrupt, match="11 of 13 frames are kept"):
         simulate(SCENE, frames=frames, directory=out, workers=2, progress=stop_after)
-    whole = simulate(SCENE, frames=frames, directory=out, resume=True)
-    assert whole.summary["resumed_frames"] == 11 and whole.summary["unfinished_frames"] == 0
+    results = simulate(SCENE, frames=frames, directory=out, resume=True)
+    assert results.summary["resumed_frames"] == 11 and results.summary["unfinished_frames"] == 0
     assert np.isfinite(read_results(out)["force_total_BW"]).all()
 
 
-def test_a_pool_starts_its_workers_at_once_and_ends_them_with_the_block():
+def test_a_pool_starts_its_workers_immediately_and_ends_them_with_its_block():
     task, jobs = Task(functools.partial, (max,)), [(n, 10 - n) for n in range(10)]
     with PoolOptions(2).team(task, len(jobs)) as team:
         answers = dict(team.answers(jobs))
@@ -98,8 +100,8 @@ def test_workers_do_not_repeat_warnings(tmp_path, caplog, capfd):
     mesh = scene.parent / "insert.stl"
     content, record = mesh.read_bytes(), 50
     count = int.from_bytes(content[80:84], "little") + 1
-    again = content[84 : 84 + record]
-    mesh.write_bytes(content[:80] + count.to_bytes(4, "little") + content[84:] + again)
+    duplicate = content[84 : 84 + record]
+    mesh.write_bytes(content[:80] + count.to_bytes(4, "little") + content[84:] + duplicate)
     simulate(scene, frames=slice(0, 96, 8), workers=2)
     assert [message for message in caplog.messages if "duplicate" in message]
     assert "duplicate" not in capfd.readouterr().err

@@ -12,6 +12,7 @@ class Terminal(io.StringIO):
 
 
 def run_through(stream):
+    """Return the output of three stages, the second with four frames, the third with two plots."""
     with Stages(3, stream) as stages:
         stages.begin("reading")
         assert list(stages.frames(range(4))) == [0, 1, 2, 3]

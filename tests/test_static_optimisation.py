@@ -31,25 +31,25 @@ def joint(arms, strength, moment, **changes):
 
 
 def test_one_muscle_balances_the_moment():
-    found = share_load(joint([0.04], [1000.0], 20.0))
-    assert found.activation == pytest.approx([0.5])
-    assert found.others == pytest.approx([0.0], abs=1e-9)
+    solution = share_load(joint([0.04], [1000.0], 20.0))
+    assert solution.activation == pytest.approx([0.5])
+    assert solution.others == pytest.approx([0.0], abs=1e-9)
 
 
 @pytest.mark.parametrize("exponent", [2.0, 3.0, 5.0])
 def test_two_muscles_share_by_lagrange_s_condition(exponent):
     arms, strength, moment = np.array([0.04, 0.02]), np.array([900.0, 1500.0]), 30.0
-    found = share_load(joint(arms, strength, moment, exponent=exponent)).activation
+    solution = share_load(joint(arms, strength, moment, exponent=exponent)).activation
     # p a_i^(p-1) = lambda r_i F_i, and the sum of r_i F_i a_i is the moment
     shape = (arms * strength) ** (1 / (exponent - 1))
     expected = shape * moment / (arms * strength @ shape)
-    np.testing.assert_allclose(found, expected, rtol=1e-7)
+    np.testing.assert_allclose(solution, expected, rtol=1e-7)
 
 
 def test_a_muscle_at_full_activation_leaves_the_remaining_moment_to_the_other():
     arms, strength = [0.04, 0.02], [500.0, 1500.0]
-    found = share_load(joint(arms, strength, 48.0)).activation  # unbounded: 0.74 and 1.11
-    np.testing.assert_allclose(found, [(48.0 - 30.0) / 20.0, 1.0], rtol=1e-9)
+    solution = share_load(joint(arms, strength, 48.0)).activation  # unbounded: 0.74 and 1.11
+    np.testing.assert_allclose(solution, [(48.0 - 30.0) / 20.0, 1.0], rtol=1e-9)
 
 
 def test_the_moment_of_a_reserve_follows_its_cost():
@@ -65,10 +65,10 @@ def test_the_moment_of_a_reserve_follows_its_cost():
 def test_the_residual_of_an_interior_optimum_is_relative_to_the_terms_of_the_gradient():
     free = {"lower": np.array([-FREE]), "upper": np.array([FREE]), "reserve": np.array([3.0])}
     problem = joint([0.0266], [50.0], 7.2, **free)
-    found = share_load(problem)
-    assert abs(problem.gradient(found.activation)[0]) < 1e-14
-    assert found.kkt_residual < 1e-14
-    moved = replace(found, activation=found.activation + 1e-6)
+    solution = share_load(problem)
+    assert abs(problem.gradient(solution.activation)[0]) < 1e-14
+    assert solution.kkt_residual < 1e-14
+    moved = replace(solution, activation=solution.activation + 1e-6)
     assert kkt_residual(problem, moved) > 1e-7
 
 
@@ -107,15 +107,15 @@ def random_problem(seed, exponent=2.0):
 @given(st.integers(0, 10**6), st.sampled_from([2.0, 3.0]))
 def test_the_optimality_conditions_are_satisfied(seed, exponent):
     problem = random_problem(seed, exponent)
-    found = share_load(problem)
-    assert found.kkt_residual < 1e-8
-    np.testing.assert_allclose(found.others, problem.others(found.activation))
+    solution = share_load(problem)
+    assert solution.kkt_residual < 1e-8
+    np.testing.assert_allclose(solution.others, problem.others(solution.activation))
     # the cost does not decrease towards any other feasible point
     rng = np.random.default_rng(seed)
-    feasible = np.clip(found.activation + 0.01 * rng.normal(size=20), 0, 1)
-    slope = problem.gradient(found.activation) @ (feasible - found.activation)
-    change = problem.gain @ (feasible - found.activation)
-    assert slope + found.other_multiplier @ change >= -1e-9 * np.abs(slope).max(initial=1.0)
+    feasible = np.clip(solution.activation + 0.01 * rng.normal(size=20), 0, 1)
+    slope = problem.gradient(solution.activation) @ (feasible - solution.activation)
+    change = problem.gain @ (feasible - solution.activation)
+    assert slope + solution.other_multiplier @ change >= -1e-9 * np.abs(slope).max(initial=1.0)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -129,7 +129,7 @@ def test_slsqp_has_the_same_optimum(seed, exponent):
         {"type": "eq", "fun": lambda a: (problem.others(a) / size)[equal]},
         {"type": "ineq", "fun": lambda a: ((problem.others(a) - problem.lower) / size)[bounded]},
     ]
-    own = share_load(problem)
+    solution = share_load(problem)
     other = minimize(
         problem.cost,
         np.full(20, 0.5),
@@ -140,5 +140,5 @@ def test_slsqp_has_the_same_optimum(seed, exponent):
         options={"maxiter": 1000, "ftol": 1e-14},
     )
     assert other.success
-    np.testing.assert_allclose(own.activation, other.x, atol=2e-5)
-    assert problem.cost(own.activation) <= other.fun * (1 + 1e-9)
+    np.testing.assert_allclose(solution.activation, other.x, atol=2e-5)
+    assert problem.cost(solution.activation) <= other.fun * (1 + 1e-9)

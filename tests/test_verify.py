@@ -30,28 +30,31 @@ def run(finished, tmp_path):
 
 
 def verified(out, capfd):
+    """Return exit status and output of `tkamb verify`."""
     capfd.readouterr()
     status = main(["verify", str(out)])
-    said = capfd.readouterr()
-    return status, said.out + said.err
+    output = capfd.readouterr()
+    return status, output.out + output.err
 
 
 def test_unchanged_results_are_verified(run, capfd):
-    status, said = verified(run[1], capfd)
-    assert status == 0 and "input file(s) have not changed" in said
+    status, output = verified(run[1], capfd)
+    assert status == 0 and "input file(s) have not changed" in output
     assert main(["report", str(run[1])]) == 0
     assert verified(run[1], capfd)[0] == 0
 
 
-def swap_cell(out):
+def change_cell(out):
+    """Increase one number of results.csv by 5 %."""
     path = out / "results.csv"
-    header, first, *rest = path.read_text().splitlines()
+    header, first, *other_lines = path.read_text().splitlines()
     cells = first.split(",")
     cells[5] = repr(float(cells[5]) * 1.05)
-    path.write_text("\n".join([header, ",".join(cells), *rest]) + "\n")
+    path.write_text("\n".join([header, ",".join(cells), *other_lines]) + "\n")
 
 
-def flip_map(out):
+def change_map(out):
+    """Invert one bit of contact.h5."""
     path = out / "contact.h5"
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 4
@@ -59,14 +62,15 @@ def flip_map(out):
 
 
 def change_summary(out):
+    """Increase the body mass in summary.json."""
     path = out / "summary.json"
     content = json.loads(path.read_text())
     path.write_text(json.dumps(content | {"body_mass_kg": content["body_mass_kg"] + 1}))
 
 
 CHANGES = [
-    (swap_cell, "results.csv has changed"),
-    (flip_map, "contact.h5 has changed"),
+    (change_cell, "results.csv has changed"),
+    (change_map, "contact.h5 has changed"),
     (change_summary, "summary.json has changed"),
     (lambda out: (out / "contact.h5").unlink(), "contact.h5 is missing"),
 ]
@@ -74,21 +78,21 @@ CHANGES = [
 
 def test_the_base_of_a_scene_is_an_input(tmp_path, capfd):
     base = write_scene(tmp_path, contact__resolution_mm=3.0, contact__model="foundation")
-    own, out = tmp_path / "own.toml", tmp_path / "out"
-    own.write_text('base = "scene.toml"\n[patient]\nmass_kg = 80.0\n')
-    assert main(["run", str(own), "--out", str(out), "--frames", "0:1"]) == 0
+    scene, out = tmp_path / "own.toml", tmp_path / "out"
+    scene.write_text('base = "scene.toml"\n[patient]\nmass_kg = 80.0\n')
+    assert main(["run", str(scene), "--out", str(out), "--frames", "0:1"]) == 0
     assert verified(out, capfd)[0] == 0
     base.write_text(base.read_text() + "\n# by another hand\n")
-    status, said = verified(out, capfd)
-    assert status != 0 and f"input {base} has changed" in said
+    status, output = verified(out, capfd)
+    assert status != 0 and f"input {base} has changed" in output
 
 
 @pytest.mark.parametrize(("change", "words"), CHANGES)
 def test_every_command_reports_changed_results(run, capfd, change, words):
     scene, out = run
     change(out)
-    status, said = verified(out, capfd)
-    assert status == 1 and words in said
+    status, output = verified(out, capfd)
+    assert status == 1 and words in output
     resume = ["run", str(scene / "scene.toml"), "--out", str(out), "--frames", "0:9:4", "--resume"]
     view = ["view", str(out), "--html", str(out / "v.html")]
     for command in (["report", str(out)], resume, view):
@@ -104,21 +108,21 @@ def test_changed_input_files_are_named(finished, tmp_path, capfd):
     before = motion.read_text()
     try:
         motion.write_text(before + "\n")
-        status, said = verified(out, capfd)
-        assert status == 1 and f"{motion} has changed since it was read" in said
+        status, output = verified(out, capfd)
+        assert status == 1 and f"{motion} has changed since it was read" in output
         motion.unlink()
-        status, said = verified(out, capfd)
-        assert status == 1 and f"{motion}: no such file" in said
+        status, output = verified(out, capfd)
+        assert status == 1 and f"{motion}: no such file" in output
     finally:
         motion.write_text(before)
 
 
 def test_results_of_another_code_get_a_note(run, capfd, monkeypatch):
     monkeypatch.setattr("tkamb.run.results_folder.code_identity", lambda: "other")
-    status, said = verified(run[1], capfd)
+    status, output = verified(run[1], capfd)
     code = json.loads((run[1] / "summary.json").read_text())["identity"]["code of tkamb"]
-    assert status == 0 and "computed by other code" in said
-    assert f", {code[:12]}; this is " in said and ", other)" in said
+    assert status == 0 and "computed by other code" in output
+    assert f", {code[:12]}; this is " in output and ", other)" in output
 
 
 def test_a_run_of_another_code_is_not_resumed(run, capfd, monkeypatch):
@@ -134,8 +138,8 @@ def test_a_folder_without_results_is_refused(tmp_path, capfd):
         folder = tmp_path / f"{name}{len(text)}"
         folder.mkdir()
         (folder / name).write_text(text)
-        status, said = verified(folder, capfd)
-        assert status == 2 and said.count("\n") == 1
+        status, output = verified(folder, capfd)
+        assert status == 2 and output.count("\n") == 1
     assert verified(tmp_path / "nothing", capfd)[0] == 2
 
 
@@ -143,8 +147,8 @@ def test_results_without_hashes_cannot_be_verified(run, capfd):
     path = run[1] / "summary.json"
     content = json.loads(path.read_text())
     path.write_text(json.dumps({k: v for k, v in content.items() if k != "files"}))
-    status, said = verified(run[1], capfd)
-    assert status == 1 and "no SHA-256" in said
+    status, output = verified(run[1], capfd)
+    assert status == 1 and "no SHA-256" in output
 
 
 def test_a_frame_of_another_run_or_number_counts_as_absent(tmp_path):
@@ -181,8 +185,8 @@ def test_a_second_run_in_a_folder_at_the_same_time_is_refused(run, capfd):
         assert main(["run", str(scene / "scene.toml"), "--out", str(out), "--frames", "0:1"]) == 2
     finally:
         claim.os.close(descriptor)
-    said = capfd.readouterr().err
-    assert "another tkamb is writing" in said and said.count("\n") == 1
+    output = capfd.readouterr().err
+    assert "another tkamb is writing" in output and output.count("\n") == 1
     assert verified(out, capfd)[0] == 0
 
 

@@ -41,25 +41,25 @@ def shipped_run():
 
 def matrix(browser, path):
     """Return the pose (4, 4) of a node in its parent."""
-    found = browser.evaluate(
+    values = browser.evaluate(
         f"(() => {{ const o = tkamb.node('{path}').object; o.updateMatrix();"
         "return Array.from(o.matrix.elements); })()"
     )
-    return np.array(found).reshape(4, 4).T
+    return np.array(values).reshape(4, 4).T
 
 
 def levels(browser, view=0):
     """Return the colour level at every point of the drawn pressure map."""
-    found = browser.evaluate(
+    values = browser.evaluate(
         f"Array.from(tkamb.node('/tkamb/{view}/pressure map/map/<object>')"
         ".object.geometry.attributes.level.array)"
     )
-    return np.array(found)
+    return np.array(values)
 
 
 def force(browser, name, view=0):
     """Return the force (3,), N, of an arrow from its shaft and head; zero if it is hidden."""
-    found = browser.evaluate(
+    values = browser.evaluate(
         f"""(() => {{
         const view = tkamb.views[{view}], node = tkamb.node(`${{view.root}}/forces/{name}`).object;
         if (!node.visible) return [0, 0, 0];
@@ -71,7 +71,7 @@ def force(browser, name, view=0):
         return way.multiplyScalar(length / tkamb.arrowLength * view.body_weight).toArray();
         }})()"""
     )
-    return np.array(found)
+    return np.array(values)
 
 
 def move_slider(browser, frame):
