@@ -131,8 +131,13 @@ def test_all_loads_together_give_the_rate_of_momentum_of_the_leg():
     for _ in range(20):
         motion = random_motion(chain, rng)
         state = chain.at(motion)
-        ground = state.ground_reaction(
-            rng.normal(size=3) * 400, rng.normal(size=3), rng.normal(size=3) * 5
+        force, point, moment = (rng.normal(size=3) * size for size in (400.0, 1.0, 5.0))
+        in_insert = state.laboratory_in_insert
+        ground = PointForces(
+            "tibia",
+            transform(in_insert, point)[None],
+            rotate(in_insert, force)[None],
+            rotate(in_insert, moment),
         )
         unknown_loads = all_unknowns(state, rng)
         columns = state.generalised([unknown.loads for unknown in unknown_loads])
