@@ -123,7 +123,7 @@ def test_one_foot_on_two_plates_has_the_sum_of_their_wrenches(tmp_path):
     np.testing.assert_allclose(ground.moment[:, 1], free, atol=1e-3)
     assert ground.loaded.all()
     on_plate = table.model_copy(update={"force": "on the plate"})
-    with pytest.raises(InputError, match="leave out force"):
+    with pytest.raises(InputError, match="leave out the key force"):
         load_ground_reaction(on_plate, time, "right")
 
 

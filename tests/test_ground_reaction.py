@@ -137,7 +137,7 @@ def test_force_on_the_plate_is_the_opposite_of_that_on_the_foot(tmp_path):
         np.testing.assert_array_equal(getattr(on_plate, name), getattr(on_foot, name))
     with pytest.raises(InputError, match='say force = "on the plate"'):
         load_ground_reaction(plate(file), AT, "left")
-    with pytest.raises(InputError, match="leave out force"):
+    with pytest.raises(InputError, match="leave out the key force"):
         load_ground_reaction(plate(foot, force="on the plate"), AT, "left")
 
 

@@ -258,8 +258,8 @@ def _add_poses(command: argparse.ArgumentParser) -> None:
         "--stance",
         type=_interval,
         metavar="A:B",
-        help="interval of the poses' time column for the mean position of the knee centre in the "
-        "shank",
+        help="part of the poses with a loaded foot, in the unit of their time column; the mean "
+        "position of the knee centre in the shank is computed from it",
     )
 
 

@@ -76,8 +76,9 @@ def add_press(commands: Any) -> None:
     press.add_argument(
         "--restore-when",
         choices=("both", "either"),
-        help="with --adjust: restore the rotation of --pose when penetration and angle after the "
-        "press exceed the adjustment (both), or when one of them does (either); default: both",
+        help="with --adjust: the press is compared with the adjustment, in penetration and in "
+        "angle; the rotation of --pose is restored if both are larger than the adjustment's "
+        "(both), or at least one of them (either); default: both",
     )
     press.add_argument(
         "--out", type=Path, metavar="F.vtp", help="file for the pressure map, for ParaView"

@@ -175,7 +175,7 @@ def headline(uncertainty: "Uncertainty") -> list[str]:
             + (
                 ""
                 if with_discrepancy is None
-                else f", with the discrepancy in {with_discrepancy:.0%}"
+                else f" ({with_discrepancy:.0%} if the band includes the model's discrepancy)"
             )
         )
     if words := (uncertainty.results.summary.get("discrepancy") or {}).get("words"):

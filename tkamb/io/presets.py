@@ -104,7 +104,7 @@ class Preset:
     needs: ClassVar[Mapping[str, str]] = {}
 
     def lacks(self, content: Mapping[str, Any]) -> str | None:
-        """Return words on data other than tables that a scene lacks for the study, or None.
+        """Return words on what the study needs and the scene lacks, apart from `needs`, or None.
 
         Args:
             content: content of the scene's file.

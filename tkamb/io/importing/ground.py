@@ -322,8 +322,8 @@ def _unmeasured_line(
     if not len(times):
         return []
     return [
-        f"ATTENTION: off its plates the foot is nearly still in {len(times)} frames, first at "
-        f"{times[0]:.3f} s: it may stand on an unmeasured surface"
+        f"ATTENTION: in {len(times)} frames, first at {times[0]:.3f} s, the foot is nearly still "
+        "but not on its plates: it may stand on an unmeasured surface"
     ]
 
 

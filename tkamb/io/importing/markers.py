@@ -143,11 +143,12 @@ def segments_of(recorded: Table, segments: list[ModelSegment]) -> list[ModelSegm
 def _equal_line(recorded: Table) -> str:
     """Return words on the labels that occur twice and are therefore ignored, or ""."""
     names = list(dict.fromkeys(column[:-2] for column in recorded.equal))
-    return f"; it has two markers {', '.join(names)}: rename one of each" if names else ""
+    listed = ", ".join(names)
+    return f"; labels that occur twice are ignored ({listed}): rename one of each" if names else ""
 
 
 def _clashing_prefixes(labels: list[str], needed: Sequence[str]) -> list[str]:
-    """Return the prefixes of the needed markers that occur with several prefixes."""
+    """Return the prefixes of those needed markers whose plain label has several prefixes."""
     plain = {plain_label(name) for name in needed}
     result: dict[str, list[str]] = {}
     for label in labels:

@@ -332,7 +332,8 @@ def _leg_scale(request: ImportRequest, leg_mass: float) -> tuple[float, str]:
     """Return the factor on the masses of a model of one leg, and a remark on it.
 
     Such a model has the mass of a leg, or of the whole body if a scaling tool scaled it to the
-    subject's mass. A scaled leg has the share `MODEL_MASS.leg_mass_share` of the subject's mass.
+    subject's mass. If the factor is not 1, the leg gets the share `MODEL_MASS.leg_mass_share` of
+    the subject's mass.
 
     Args:
         request: the import, with the subject's mass.
@@ -367,7 +368,7 @@ def _leg_scale(request: ImportRequest, leg_mass: float) -> tuple[float, str]:
 
 
 def _model_lines(model: OpenSimModel) -> list[str]:
-    """Return notes on reading the model, and lines on unreadable parts that the knee can lack."""
+    """Return notes on reading the model, and lines on unreadable parts that are not needed."""
     lines = [f"model: {notice}" for notice in model.notices]
     unread = [f"{element.kind} '{element.name}'" for element in model.unread]
     if unread:

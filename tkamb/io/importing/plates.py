@@ -3,8 +3,8 @@
 The forces are from the plates of a C3D file, or from a table of ground reactions. Programs name the
 columns of such a table in many ways: `ground_force_1_vx`, `1_ground_force_px`,
 `ground_torque_1_y`, `ground_moment_1_mx`, `ground_force_calcn_r_mx`, `f1_1`, `FP2_tz`. A column
-name contains the kind (force, point, moment), the axis, and the name of a force. If a force has no
-moment, a moment column that belongs to no force is an error.
+name contains the kind (force, point, moment), the axis, and the name of a force. A moment column
+whose name fits no force is an error, unless every force of the table has a moment of its own.
 """
 
 import re
@@ -73,7 +73,9 @@ def table_forces(table: Table) -> list[TableForce]:
     """Return the forces of a table, in the order of their columns.
 
     Raises:
-        InputError: a moment column belongs to no force, or one axis has two columns.
+        InputError: one axis has two columns, or a moment column belongs to no force while a force
+            has no moment.
+
     """
     columns = [c for name in table.columns if (c := _parsed_column(name)) is not None]
     result: dict[str, TableForce] = {}
@@ -316,7 +318,7 @@ def feet_loads(forces: list[RecordedForce], feet: Feet) -> list[Load]:
 def _load(
     source: RecordedForce, time: Array, point: Array, force: Array, middles: dict[str, Array]
 ) -> Load:
-    """Return a load. For a foot on a step, its point is where the force's line meets the step."""
+    """Return a load. On a step, the centre of pressure is where the force's line meets the step."""
     distances, surface = {}, {}
     for side, middle in middles.items():
         above = middle[:, 1] - point[:, 1]

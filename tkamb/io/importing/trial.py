@@ -127,8 +127,8 @@ class TrialFrameSettings:
     """Number of frames of a trial in an imported scene."""
 
     frames_per_period: float = 5.0
-    """Number of frames per period of the cut-off frequency. Chosen because a low-pass-filtered
-    motion does not change faster."""
+    """Number of frames per period of the cut-off frequency. Chosen because a motion that is
+    low-pass-filtered at this frequency changes little between two such frames."""
 
 
 TRIAL_FRAMES = TrialFrameSettings()
@@ -258,7 +258,7 @@ def _facing_line(request: ImportRequest, facing: Facing) -> str:
     if request.laboratory_axes is not None:
         return line + ", as given"
     return line + (
-        f" (the subject faces {facing.forward_deg:.0f} deg off that axis and leans by "
+        f" (the subject faces {facing.forward_deg:.0f} deg off the forward axis and leans by "
         f"{facing.up_deg:.0f} deg, on average)"
     )
 

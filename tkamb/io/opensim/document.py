@@ -188,8 +188,8 @@ class Document:
         raise InputError(
             "is a function that is not read",
             self.where(element),
-            "Constant, LinearFunction, PolynomialFunction, PiecewiseLinearFunction, SimmSpline "
-            "and MultiplierFunction are",
+            "tkamb reads Constant, LinearFunction, PolynomialFunction, PiecewiseLinearFunction, "
+            "SimmSpline and MultiplierFunction",
         )
 
     def held_function(self, element: Element, tag: str) -> Function | None:

@@ -206,7 +206,7 @@ def _constraints(
                 raise InputError(
                     "is a constraint that is not read",
                     document.where(element),
-                    "CoordinateCouplerConstraint and ConstantDistanceConstraint are",
+                    "tkamb reads CoordinateCouplerConstraint and ConstantDistanceConstraint",
                 )
     return _followers_last(couplers), tuple(distances), not_enforced
 

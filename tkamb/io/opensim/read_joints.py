@@ -258,7 +258,7 @@ def _standard_axes(
         raise InputError(
             "is a joint that is not read",
             document.where(element),
-            f"CustomJoint, {', '.join(STANDARD_JOINTS)} are",
+            f"tkamb reads CustomJoint, {', '.join(STANDARD_JOINTS)}",
         )
     rotations, translations = axes
     if len(names) != len(rotations) + len(translations):

@@ -129,7 +129,10 @@ def _around(
 def _cylinder(
     start: Array, end: Array, radius: float, length: float, quadrant: tuple[int, int] | None
 ) -> WrapTouch:
-    """Return strings around a cylinder along z. A string beyond its ends does not touch."""
+    """Return strings around a cylinder along z.
+
+    A string does not touch if both touching points lie beyond the ends of the cylinder.
+    """
     (near, angle), (far, last) = _polar(start), _polar(end)
     if quadrant is None or quadrant[0] == 2:
         sweep = _wrapped(last - angle)

@@ -376,8 +376,8 @@ class _Reader:
     def _zero(self) -> slice | None:
         """Return the samples that FORCE_PLATFORM:ZERO states as unloaded; None if it states none.
 
-        ZERO holds frame numbers of the recording. In a recording cut out of a longer one, numbers
-        outside it are counted from its first frame.
+        ZERO holds two frame numbers. In a recording cut out of a longer one, they are numbers of
+        the longer one if both lie within the recording. Otherwise they count from its first frame.
         """
         frames = self._parameters.integers("FORCE_PLATFORM:ZERO")
         if len(frames) != 2 or frames[1] < 1 or frames[1] < frames[0]:

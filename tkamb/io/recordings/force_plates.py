@@ -328,8 +328,8 @@ class PlateLoadSettings:
     """s: time before and after a load in which the wrench is used. Chosen because a foot strikes or
     leaves within 0.02 s."""
     quiet_share: float = 0.1
-    """1: share of the samples, those with the smallest forces. Their median is the unloaded level.
-    Chosen because a plate is usually unloaded for longer."""
+    """1: this share of the samples, those with the smallest forces, is taken as unloaded. Their
+    median is the unloaded level. Chosen because a plate is usually unloaded for longer."""
     quiet_spread_N: float = 2.0
     """N: largest range of these samples. A larger range gives no unloaded level. Chosen because the
     force of a foot varies more."""

@@ -460,7 +460,7 @@ def _check_upward(force: Array, source: GroundReactionTable) -> None:
             source.file,
             "check [ground_reaction] columns and laboratory_axes; if it is the force on the "
             f"{'foot' if source.sign < 0 else 'plate'}, "
-            + ("leave out force" if source.sign < 0 else 'say force = "on the plate"'),
+            + ("leave out the key force" if source.sign < 0 else 'say force = "on the plate"'),
         )
 
 

@@ -214,7 +214,9 @@ class Segment:
         labels: (m) labels of its markers.
         points: (m, 3) m, its markers in its frame.
         weights: (m,) weights of the markers' squared distances.
-        joined_to: "shank" or "thigh", which a ball joint connects to a neighbour; else empty.
+        joined_to: of a neighbour: the segment, "shank" or "thigh", to which a ball joint connects
+            it. Empty for shank and thigh.
+
         joint: (3,) m, the ball joint in the frame of `joined_to`.
         centre: (3,) m, the ball joint in the neighbour's frame.
     """
