@@ -106,7 +106,7 @@ def test_singular_inertia(tmp_path, capfd):
     path = write_scene(tmp_path)
     urdf = tmp_path / "patient.urdf"
     urdf.write_text(urdf.read_text().replace('<mass value="10.620000"/>', '<mass value="0"/>'))
-    assert "singular inertia" in run_refused(capfd, path)
+    assert "impossible inertia" in run_refused(capfd, path)
 
 
 def test_urdf_with_a_joint_of_no_known_type(tmp_path, capfd):

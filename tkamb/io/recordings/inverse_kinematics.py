@@ -82,10 +82,10 @@ class NormalEquations:
 
 
 class MarkerChain(Protocol[State]):
-    """Interface of a chain with n degrees of freedom and m markers that is fitted to markers."""
+    """A chain with n degrees of freedom and m markers, to be fitted to measured markers."""
 
     def places(self, state: State) -> Array:
-        """Return the markers (f, m, 3) m."""
+        """Return the positions (f, m, 3) m of the chain's markers."""
 
     def normal(self, state: State, target: Array, weights: Array) -> NormalEquations:
         """Return the normal equations for measured markers (f, m, 3) m with weights (f, m)."""
@@ -106,8 +106,8 @@ class ChainFit(Generic[State]):
 
     Args:
         state: the fitted state.
-        rms: (f,) m, root mean square distance of the visible markers; NaN without markers.
-        distance: (f, m) m, distance of each marker; NaN for a missing one.
+        rms: (f,) m, root mean square of `distance`; NaN without markers.
+        distance: (f, m) m, from each measured marker to the chain's; NaN for a missing marker.
         solved: (f,) whether the last step was below `INVERSE_KINEMATICS.step_tolerance`.
         steps: number of iterations.
     """
@@ -210,11 +210,11 @@ class Segment:
     """A body with markers.
 
     Args:
-        name: "shank", "thigh", or the name of a neighbour of one of them.
+        name: "shank", "thigh", or the name of a neighbouring segment.
         labels: (m) labels of its markers.
         points: (m, 3) m, its markers in its frame.
         weights: (m,) weights of the markers' squared distances.
-        joined_to: "shank" or "thigh", which a ball joint connects to a neighbour; else empty.
+        joined_to: for a neighbour, "shank" or "thigh": the segment at its ball joint; else empty.
         joint: (3,) m, the ball joint in the frame of `joined_to`.
         centre: (3,) m, the ball joint in the neighbour's frame.
     """
@@ -278,7 +278,7 @@ class LegChain:
         return poses
 
     def start(self, fitted: dict[str, Array], neutral: Array) -> LegState:
-        """Return an initial guess from the fits of the single segments.
+        """Return an initial guess from the separate fits of the segments.
 
         Args:
             fitted: segment -> (f, 4, 4) pose in the world; NaN in frames without a fit.
@@ -301,7 +301,7 @@ class LegChain:
         return state
 
     def places(self, state: LegState) -> Array:
-        """Return the markers (f, m, 3) m."""
+        """Return the positions (f, m, 3) m of the chain's markers."""
         return self.markers(state)[0]
 
     def normal(self, state: LegState, target: Array, weights: Array) -> NormalEquations:
@@ -318,7 +318,7 @@ class LegChain:
         )
 
     def markers(self, state: LegState) -> tuple[Array, Array]:
-        """Return the markers (f, m, 3) m and their Jacobian (f, m, 3, n)."""
+        """Return the chain's marker positions (f, m, 3) m and their Jacobian (f, m, 3, n)."""
         poses, places, blocks = self.poses(state), [], []
         for segment in self.segments.values():
             x = transform(poses[segment.name], segment.points[None])
