@@ -145,8 +145,8 @@ class Cycle:
     ) -> "Cycle":
         """Return the cycle of a recorded motion.
 
-        The cycle is closed if it was recorded from 0 to 100 % and the coordinates at both ends differ
-        by no more than their largest step between neighbouring samples.
+        The cycle is closed if it was recorded from 0 to 100 %, and the coordinates at its ends
+        differ by no more than their largest step between neighbouring samples.
 
         Args:
             percent: (n,) recorded per cent of the cycle.
