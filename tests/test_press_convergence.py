@@ -8,11 +8,11 @@ from inserts import DATA
 from tkamb.cli import main
 
 JW_ALIGNED = ("jw", "0.00192979 0 0 0 0 0")
-"""Subject and pose: aligned components, 0 deg of flexion, centred on the dishes of the insert."""
+"""Subject and pose: aligned components at 0 deg of flexion, centred on the insert's dishes."""
 DM_STANCE = ("dm", "-0.0065 0.041674 0.00014 -0.2406 2.9164 -9.9867")
 """Subject and recorded pose at 30 % of the gait cycle."""
 DM_PRESSED_WIDE = ("dm", "-0.00616 0.041501 -0.000712 -1.1287 2.67 -9.8262")
-"""Subject and recorded pose at 24 %: the lateral contact, at an edge, is several cells wide."""
+"""Subject and recorded pose at 24 %: the lateral contact at an edge is several cells wide."""
 
 
 def pressed(capsys, subject, pose, size, *flags):
@@ -76,5 +76,5 @@ def test_dm_converges_with_its_peak_pressure_in_a_wide_contact(capsys):
 
 
 def test_a_peak_pressure_at_an_edge_is_flagged(capsys):
-    """DM's flat condyles press with their edges: cells of 0.75 mm for 1 mm raise the peak by 12 %."""
+    """DM's flat condyles press with their edges. With 0.75 mm, not 1, the peak is 12 % larger."""
     assert "lateral peak pressure lies at an edge" in pressed(capsys, *DM_STANCE, 2.0)["flags"][0]

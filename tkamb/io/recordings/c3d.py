@@ -147,7 +147,7 @@ def read_c3d(path: str | Path, units: GivenUnits | None = None) -> Recording:
 
     Args:
         path: the file.
-        units: the user's units, used where the file's are missing or unknown.
+        units: the user's units; None: those of the file.
 
     Raises:
         InputError: no such file, not a regular file, not C3D, cut short, no valid frame rate, or

@@ -7,7 +7,7 @@ A file begins with a header of 512 bytes. Its parameter section is a chain of re
 or a parameter with type, dimensions and values. Its data section holds frame after frame: four
 words per marker (x, y, z, residual and cameras), then the analog samples of that frame, channel
 by channel. Words are 16-bit integers if the scale is positive, and 32-bit floats if it is
-negative. The byte order and the format of the floats is those of the machine that wrote the file.
+negative. Byte order and float format are those of the machine that wrote the file.
 
 Format: C3D user guide, https://www.c3d.org.
 """

@@ -132,12 +132,14 @@ def fit_chain(
     """
     visible = np.isfinite(measured).all(axis=2)
     target, frame_weights = np.nan_to_num(measured), np.where(visible, weights, 0.0)
-    damping, last = np.full(len(measured), 1e-6), np.full(len(measured), np.inf)
+    damping, last_size = np.full(len(measured), 1e-6), np.full(len(measured), np.inf)
     active, steps = np.arange(len(measured)), 0
     state, residual = start, chain.normal(start, target, frame_weights)
     while steps < INVERSE_KINEMATICS.max_iterations:
         step = _step(
-            residual.of(active), damping[active], last[active] < INVERSE_KINEMATICS.newton_below
+            residual.of(active),
+            damping[active],
+            last_size[active] < INVERSE_KINEMATICS.newton_below,
         )
         trial = chain.moved(chain.chosen(state, active), step)
         size = np.abs(step).max(axis=1)
@@ -156,7 +158,7 @@ def fit_chain(
         state = chain.replaced(state, accepted, chain.chosen(trial, rows))
         residual = residual.replaced(accepted, trial_residual.of(rows))
         damping[active] = np.clip(damping[active] * np.where(better, 0.1, 10.0), 1e-12, 1e6)
-        last[active] = np.where(better, size, np.inf)
+        last_size[active] = np.where(better, size, np.inf)
     distance = np.where(visible, np.linalg.norm(chain.places(state) - target, axis=2), np.nan)
     count = visible.sum(axis=1)
     rms = np.sqrt(np.nansum(distance**2, axis=1) / np.maximum(count, 1))

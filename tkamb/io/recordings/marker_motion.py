@@ -246,7 +246,7 @@ def _compare_readings(
     """
     assert source.markers is not None
     method = source.markers.method
-    knees = {name: _knee(low @ chain.insert, high) for name, (low, high) in readings.items()}
+    knees = {name: _knee(shank @ chain.insert, thigh) for name, (shank, thigh) in readings.items()}
     missing = np.concatenate(
         [np.isnan(measured[name]).any(axis=2) for name in KNEE_SEGMENTS], axis=1
     )

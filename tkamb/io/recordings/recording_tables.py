@@ -430,9 +430,11 @@ class EmgTable(SceneTable):
     @property
     def sentence(self) -> str:
         """A sentence on the computation and the use of the envelopes."""
-        first = "" if self.high_pass_Hz == "none" else f"high-passed at {self.high_pass_Hz:g} Hz, "
+        high_pass = (
+            "" if self.high_pass_Hz == "none" else f"high-passed at {self.high_pass_Hz:g} Hz, "
+        )
         by_recording = self.normalised_by == "recording"
-        by = "their largest values in that file" if by_recording else "given values"
+        divisors = "their largest values in that file" if by_recording else "given values"
         use = {
             "report": "they are only compared with the activations",
             "target": f"the cost holds {self.weight} (a - e)^2 for each",
@@ -440,6 +442,6 @@ class EmgTable(SceneTable):
         }[self.use]
         count = sum(map(len, self.channels.values()))
         return (
-            f"EMG envelopes of {count} muscles ({self.file.name}: {first}rectified, low-passed at "
-            f"{self.cutoff_Hz:g} Hz, over {by}): {use}."
+            f"EMG envelopes of {count} muscles ({self.file.name}: {high_pass}rectified, "
+            f"low-passed at {self.cutoff_Hz:g} Hz, over {divisors}): {use}."
         )

@@ -84,8 +84,8 @@ def check_elements(robot: ElementTree.Element, path: Path) -> None:
         counts = Counter(child.tag for child in parent if isinstance(child.tag, str))
         for tag, count in counts.items():
             if tag not in _CHILDREN[parent.tag]:
-                near = names_near(tag, sorted(_CHILDREN[parent.tag]))
-                raise InputError(f"unknown element <{tag}>", where, near)
+                hint = names_near(tag, sorted(_CHILDREN[parent.tag]))
+                raise InputError(f"unknown element <{tag}>", where, hint)
             if count > 1 and tag not in _MANY:
                 raise InputError(f"has {count} elements <{tag}>", where, "keep one")
         for child in parent:
@@ -217,8 +217,8 @@ def check_chain(
             continue
         for name in chain_joints:
             if name not in joints:
-                near = f"add it, or rename one: {names_near(name, joints)}"
-                raise InputError(f"has no joint '{name}'", path, near)
+                hint = f"add it, or rename one: {names_near(name, joints)}"
+                raise InputError(f"has no joint '{name}'", path, hint)
         _check_axes(joints, chain_joints, path, side)
         _check_order(robot, joints, list(chain_joints), (start, end), path)
     names = [_ANKLE_JOINT, *KNEE_JOINTS, *PATELLA_JOINTS]
