@@ -76,5 +76,8 @@ def test_dm_converges_with_its_peak_pressure_in_a_wide_contact(capsys):
 
 
 def test_a_peak_pressure_at_an_edge_is_flagged(capsys):
-    """DM's flat condyles press with their edges. With 0.75 mm, not 1, the peak is 12 % larger."""
+    """DM's flat condyles press with their edges.
+
+    With cells of 0.75 instead of 1 mm, the peak is 12 % larger.
+    """
     assert "lateral peak pressure lies at an edge" in pressed(capsys, *DM_STANCE, 2.0)["flags"][0]
