@@ -1,4 +1,4 @@
-"""Setup of all tests: the usual handler of Ctrl-C, and a fixture of a browser."""
+"""Setup of all tests: the usual handler of Ctrl-C, and a browser fixture."""
 
 import signal
 
@@ -6,7 +6,7 @@ import pytest
 
 import headless
 
-# Tests that a shell starts in the background, and their child processes, would ignore SIGINT.
+# Without this, tests in the background of a shell and their child processes would ignore SIGINT.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 

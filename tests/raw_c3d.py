@@ -1,4 +1,4 @@
-"""Writer of C3D files of any machine, in integers or floats, with any parameter."""
+"""Writer of C3D files in the number format of any machine, as integers or floats."""
 
 import struct
 from pathlib import Path
@@ -9,7 +9,7 @@ MACHINES = {"intel": 84, "dec": 85, "mips": 86}
 
 
 class RawC3d:
-    """Writes a recording in the number format of a machine."""
+    """Writes a recording with any parameters, in the number format of a machine."""
 
     def __init__(self, machine="intel", *, integers=False, scale=0.1, first=1, rate=100.0):
         self.machine, self.integers, self.scale = machine, integers, scale
@@ -37,7 +37,7 @@ class RawC3d:
     def write(self, path: Path, points, analog=None, samples=10, frames=None):
         """Write a file of points (n, m, 3) and analog words (k, c).
 
-        The header states `frames`, by default the number of frames in the file.
+        The header states `frames` as the number of frames; by default the true number.
         """
         count, markers = points.shape[:2]
         channels = 0 if analog is None else analog.shape[1]

@@ -35,12 +35,12 @@ def read_markers(path, names, start, end):
 def read_stl(path):
     """Return the corners (k, 3, 3) of a binary STL."""
     data = Path(path).read_bytes()[84:]
-    kind = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
+    kind = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     return np.frombuffer(data, kind)["corners"].astype(float)
 
 
 def volume_centroid(corners):
-    """Return the centroid of a closed mesh."""
+    """Return the centroid (3,) of the volume in a closed mesh."""
     volumes = np.linalg.det(corners)
     return volumes @ corners.mean(axis=1) * 0.75 / volumes.sum()
 
@@ -79,21 +79,21 @@ def smoothed(time, values, cutoff):
     knots = time[0] + step * np.arange(-5, spans + 6)
     design = BSpline.design_matrix(np.clip(time, knots[5], knots[-6]), knots, 5).toarray()
     nodes, weights = np.polynomial.legendre.leggauss(3)
-    at = (knots[5:-6, None] + step * (nodes + 1) / 2).ravel()
-    third = BSpline(knots, np.eye(spans + 5), 5).derivative(3)(at)
-    bend = third.T @ (np.tile(weights * step / 2, spans)[:, None] * third)
+    points = (knots[5:-6, None] + step * (nodes + 1) / 2).ravel()
+    third = BSpline(knots, np.eye(spans + 5), 5).derivative(3)(points)
+    penalty = third.T @ (np.tile(weights * step / 2, spans)[:, None] * third)
     scaled = np.gradient(time)[:, None] * design
-    normal = design.T @ scaled + (2 * np.pi * cutoff) ** -6.0 * bend
+    normal = design.T @ scaled + (2 * np.pi * cutoff) ** -6.0 * penalty
     return BSpline(knots, np.linalg.solve(normal, scaled.T @ values), 5)
 
 
 def smoothed_cycle(time, values, cutoff):
-    """Return the smoothing spline of three equal cycles; its middle is that of a closed cycle."""
-    once = np.array(values, float)
-    once[0] = once[-1] = 0.5 * (once[0] + once[-1])
+    """Return the smoothing spline of three equal cycles; the middle one equals a closed cycle's."""
+    cycle = np.array(values, float)
+    cycle[0] = cycle[-1] = 0.5 * (cycle[0] + cycle[-1])
     period = time[-1] - time[0]
     times = np.concatenate([time[:-1] - period, time[:-1], time + period])
-    return smoothed(times, np.concatenate([once[:-1], once[:-1], once]), cutoff)
+    return smoothed(times, np.concatenate([cycle[:-1], cycle[:-1], cycle]), cutoff)
 
 
 def fit(reference_mm, measured):

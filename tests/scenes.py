@@ -1,4 +1,4 @@
-"""Copies of the shipped knee bend, with keys of its scene changed or left out."""
+"""Copies of the shipped knee bend, with changed or omitted keys of its scene."""
 
 import shutil
 import tempfile
@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 
 MODEL = Path(__file__).parents[1] / "models" / "deep_knee_bend"
-HELD = []
+TEMPORARY_FOLDERS = []
 """Temporary folders, which are deleted when the tests end."""
 
 
@@ -17,7 +17,7 @@ def write_scene(folder, drop=(), **changes):
     The contact model is `foundation`, for speed, unless the changes name another model.
 
     Args:
-        folder: the new folder, with copies of all files of the patient.
+        folder: the folder; it receives copies of all files of the patient.
         drop: tables to leave out.
         changes: "table__key" = value; None removes the key.
     """
@@ -43,10 +43,10 @@ def write_scene(folder, drop=(), **changes):
 
 @cache
 def fast_scene():
-    """Return the path of a copy of the shipped scene with `foundation`, which all tests share."""
-    held = tempfile.TemporaryDirectory(prefix="tkamb-tests-")
-    HELD.append(held)
-    return write_scene(Path(held.name) / "deep_knee_bend")
+    """Return the path of a copy of the shipped scene with `foundation`, shared by all tests."""
+    folder = tempfile.TemporaryDirectory(prefix="tkamb-tests-")
+    TEMPORARY_FOLDERS.append(folder)
+    return write_scene(Path(folder.name) / "deep_knee_bend")
 
 
 def as_toml(content):

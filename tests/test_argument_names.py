@@ -22,7 +22,7 @@ CASES = (
 
 
 @pytest.mark.parametrize(("arguments", "options", "in_python", "printed"), CASES)
-def test_an_argument_in_python_is_an_option_of_the_command(
+def test_an_error_names_the_argument_in_python_and_the_option_of_the_command(
     arguments, options, in_python, printed, tmp_path, capsys
 ):
     with pytest.raises(InputError) as caught:

@@ -20,6 +20,7 @@ def refused(capfd, *arguments):
 
 
 def run_refused(capfd, path, *more):
+    """Run a scene that must be refused without an output folder, and return the line."""
     out = path.parent / "results"
     line = refused(capfd, "run", path, "--out", out, "--frames", "0:3", *more)
     assert not out.exists()
@@ -69,24 +70,24 @@ def test_an_unusable_scene_is_refused(tmp_path, capfd, changes, words):
     assert words in run_refused(capfd, write_scene(tmp_path, **changes))
 
 
-def test_missing_scene(tmp_path, capfd):
+def test_a_missing_scene_is_refused(tmp_path, capfd):
     assert "no such scene" in run_refused(capfd, tmp_path / "scene.toml")
 
 
-def test_broken_toml(tmp_path, capfd):
+def test_broken_toml_is_refused(tmp_path, capfd):
     path = tmp_path / "scene.toml"
     path.write_text("[patient\n")
     assert "not TOML" in run_refused(capfd, path)
 
 
-def test_motion_with_nan(tmp_path, capfd):
+def test_a_motion_with_nan_is_refused(tmp_path, capfd):
     path = write_scene(tmp_path)
     rewrite(tmp_path / "motion.csv", lambda rows: rows[7].__setitem__(1, "nan"))
     line = run_refused(capfd, path)
     assert "motion.csv" in line
 
 
-def test_motion_with_unsorted_time(tmp_path, capfd):
+def test_a_motion_with_unsorted_time_is_refused(tmp_path, capfd):
     path = write_scene(tmp_path)
 
     def swap(rows):
@@ -96,20 +97,20 @@ def test_motion_with_unsorted_time(tmp_path, capfd):
     assert "time" in run_refused(capfd, path)
 
 
-def test_motion_shorter_than_the_filter_needs(tmp_path, capfd):
+def test_a_motion_shorter_than_the_filter_needs_is_refused(tmp_path, capfd):
     path = write_scene(tmp_path, motion__cutoff_Hz=3.0)
     rewrite(tmp_path / "motion.csv", lambda rows: rows.__delitem__(slice(4, None)))
     assert "motion.csv" in run_refused(capfd, path)
 
 
-def test_singular_inertia(tmp_path, capfd):
+def test_a_link_without_mass_is_refused(tmp_path, capfd):
     path = write_scene(tmp_path)
     urdf = tmp_path / "patient.urdf"
     urdf.write_text(urdf.read_text().replace('<mass value="10.620000"/>', '<mass value="0"/>'))
-    assert "singular inertia" in run_refused(capfd, path)
+    assert "impossible inertia" in run_refused(capfd, path)
 
 
-def test_urdf_with_a_joint_of_no_known_type(tmp_path, capfd):
+def test_a_urdf_with_a_joint_of_no_known_type_is_refused(tmp_path, capfd):
     """tkamb checks the type first, because Pinocchio's parser would print more lines."""
     path = write_scene(tmp_path)
     urdf = tmp_path / "patient.urdf"
@@ -117,14 +118,14 @@ def test_urdf_with_a_joint_of_no_known_type(tmp_path, capfd):
     assert "unknown type 'hinge'; there are: revolute" in run_refused(capfd, path)
 
 
-def test_urdf_without_a_needed_joint(tmp_path, capfd):
+def test_a_urdf_without_a_needed_joint_is_refused(tmp_path, capfd):
     path = write_scene(tmp_path)
     urdf = tmp_path / "patient.urdf"
     urdf.write_text(urdf.read_text().replace("knee_si", "knee_up"))
     assert "no joint 'knee_si'" in run_refused(capfd, path)
 
 
-def test_a_mesh_that_is_not_a_surface(tmp_path, capfd):
+def test_a_mesh_that_is_not_a_surface_is_refused(tmp_path, capfd):
     path = write_scene(tmp_path)
     rng = np.random.default_rng(0)
     soup = trimesh.Trimesh(
@@ -134,21 +135,21 @@ def test_a_mesh_that_is_not_a_surface(tmp_path, capfd):
     assert "insert" in run_refused(capfd, path)
 
 
-def test_a_mesh_file_of_text(tmp_path, capfd):
+def test_a_mesh_file_of_text_is_refused(tmp_path, capfd):
     path = write_scene(tmp_path)
     (tmp_path / "insert.stl").write_text("not a mesh\n")
     assert "insert.stl" in run_refused(capfd, path)
 
 
-def test_output_folder_that_cannot_be_written(tmp_path, capfd):
+def test_an_output_folder_that_cannot_be_written_is_refused(tmp_path, capfd):
     path = write_scene(tmp_path / "model")
-    blocked = tmp_path / "file"
-    blocked.write_text("")
-    line = refused(capfd, "run", path, "--out", blocked / "results")
+    file = tmp_path / "file"
+    file.write_text("")
+    line = refused(capfd, "run", path, "--out", file / "results")
     assert "cannot be written" in line
 
 
-def test_frames_outside_the_motion(tmp_path, capfd):
+def test_frames_outside_the_motion_are_refused(tmp_path, capfd):
     line = refused(
         capfd, "run", MODEL / "scene.toml", "--out", tmp_path / "r", "--frames", "90:150"
     )
@@ -156,17 +157,17 @@ def test_frames_outside_the_motion(tmp_path, capfd):
     assert not list((tmp_path / "r").glob("*"))
 
 
-def test_time_in_milliseconds(tmp_path, capfd):
+def test_time_in_milliseconds_is_refused(tmp_path, capfd):
     path = write_scene(tmp_path)
 
-    def slower(rows):
+    def in_milliseconds(rows):
         rows[1:] = [[str(1000 * float(row[0])), *row[1:]] for row in rows[1:]]
 
-    rewrite(tmp_path / "motion.csv", slower)
+    rewrite(tmp_path / "motion.csv", in_milliseconds)
     assert "the time must be in seconds" in run_refused(capfd, path)
 
 
-def test_a_mesh_file_cut_short(tmp_path, capfd):
+def test_a_mesh_file_cut_short_is_refused(tmp_path, capfd):
     path = write_scene(tmp_path)
     content = (tmp_path / "insert.stl").read_bytes()
     (tmp_path / "insert.stl").write_bytes(content[: len(content) // 2])
@@ -208,7 +209,7 @@ def test_an_impossible_load_is_refused(capfd, load):
     assert "load" in line
 
 
-def test_press_with_a_contact_that_does_not_exist(capfd):
+def test_press_refuses_an_unknown_contact_model(capfd):
     line = refused(
         capfd,
         "press",
@@ -221,7 +222,7 @@ def test_press_with_a_contact_that_does_not_exist(capfd):
     assert "hertz" in line
 
 
-def test_set_overrides_a_key_and_checks_it(tmp_path, capfd):
+def test_set_refuses_an_unknown_key(tmp_path, capfd):
     line = refused(
         capfd,
         "run",
@@ -235,5 +236,5 @@ def test_set_overrides_a_key_and_checks_it(tmp_path, capfd):
 
 
 @pytest.mark.parametrize("command", ["new", "wear"])
-def test_too_long_a_name_of_a_folder_gives_one_line(capfd, command):
+def test_a_folder_name_that_is_too_long_gives_one_line(capfd, command):
     assert "File name too long" in refused(capfd, command, "n" * 300)

@@ -174,7 +174,7 @@ class Unmoved(ElasticFoundation):
         (Unmoved, "pressing moves the femoral component"),
         (Sucking, "no wrench when apart"),
         (Forgetful, "integral of pressure"),
-        (Suggestible, "a guess changes no answer"),
+        (Suggestible, "an initial guess does not change the result"),
     ],
 )
 def test_the_conformance_test_detects_a_faulty_model(model, requirement):

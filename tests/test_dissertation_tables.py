@@ -31,8 +31,8 @@ def test_twelve_tables_of_eleven_rows_and_six_designs():
 def test_nkii_columns_of_d12_are_exchanged():
     finding = FINDINGS["si_surplus"]
     printed, exchanged = d.si_surplus(False), d.si_surplus(True)
-    wrong = [n for i, n in enumerate(d.designs()) if np.abs(printed[:, i]).max() > 0.1]
-    assert wrong == finding["designs"]
+    exchanged_designs = [n for i, n in enumerate(d.designs()) if np.abs(printed[:, i]).max() > 0.1]
+    assert exchanged_designs == finding["designs"]
     assert np.abs(printed).max() == pytest.approx(finding["largest_as_printed_BW"], abs=5e-3)
     assert np.abs(exchanged).max() == pytest.approx(finding["largest_exchanged_BW"], abs=5e-3)
     assert (exchanged < 5e-3).all()
@@ -44,7 +44,7 @@ def test_patellar_equilibrium_is_violated_in_the_named_cells():
     assert -surplus.min() == pytest.approx(finding["largest_BW"], abs=5e-3)
 
 
-def test_both_sigmas_imply_heavier_subjects():
+def test_both_sigma_designs_imply_heavier_subjects():
     finding, mass = FINDINGS["implied_mass"], d.implied_mass()
     is_sigma = np.array([name in finding["designs"] for name in d.designs()])
     means = mass.mean(axis=0)

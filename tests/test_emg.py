@@ -109,7 +109,7 @@ def test_emg_is_read_from_a_csv_table(tmp_path):
     result = load_envelopes(table(path, time="clock"), TIME)
     assert result.time[result.values["VL"].argmax()] == pytest.approx(2.0, abs=0.01)
     with pytest.raises(
-        InputError, match=r"from 9 to 12.9992 s, the motion lasts from 0 to .*offset_s"
+        InputError, match=r"from 9 to 12.9992 s, but the motion lasts from 0 to .*offset_s"
     ):
         load_envelopes(table(path, time="clock", offset_s=9.0), TIME)
     with pytest.raises(InputError, match="no column 'VM'"):

@@ -40,19 +40,19 @@ def refused(capfd, *arguments):
     return message
 
 
-@pytest.mark.parametrize("how", ["external", "link", "soft", "virtual"])
-def test_an_array_in_another_file_is_not_followed(copy, tmp_path, capfd, how):
+@pytest.mark.parametrize("link_type", ["external", "link", "soft", "virtual"])
+def test_an_array_in_another_file_is_not_followed(copy, tmp_path, capfd, link_type):
     secret = tmp_path / "secret.txt"
     secret.write_text(SECRET * 10_000)
     with h5py.File(copy / "contact.h5", "a") as file:
         shape = file["points_m"].shape
         del file["points_m"]
-        if how == "external":
+        if link_type == "external":
             size = 8 * int(np.prod(shape))
             file.create_dataset("points_m", shape, "f8", external=[(str(secret), 0, size)])
-        elif how == "link":
+        elif link_type == "link":
             file["points_m"] = h5py.ExternalLink(str(secret), "/x")
-        elif how == "soft":
+        elif link_type == "soft":
             file["points_m"] = h5py.SoftLink("/gap_m")
         else:
             layout = h5py.VirtualLayout(shape, "f8")

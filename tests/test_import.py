@@ -211,8 +211,8 @@ MISTAKES = {
 }
 SPOILT = {
     "no markers in common": ({"rename": lambda n: n[::-1]}, "markers of the shank"),
-    "markers ten times too far": ({"stretch": 10.0}, "fit only to"),
-    "markers in mm, said to be m": ({"stretch": 1000.0}, "fit only to"),
+    "markers ten times too far": ({"stretch": 10.0}, "have a residual of"),
+    "markers in mm, said to be m": ({"stretch": 1000.0}, "have a residual of"),
     "the other foot's labels": ({"osim": {"-0.04 -0.1 0.08": "-0.04 -0.1 0.48"}}, "swapped"),
     "no hip": ({"osim": {"BallJoint": "WeldJoint"}}, ""),
     "model of no mass": ({"osim": {"<mass>40.0</mass>": "<mass>-40.0</mass>"}}, "mass"),

@@ -1,4 +1,4 @@
-"""Subject JW's model in other forms that OpenSim reads: the same patient, the same forces."""
+"""Other forms of subject JW's model that OpenSim reads give the same patient and forces."""
 
 import csv
 import re
@@ -87,11 +87,11 @@ def test_another_form_gives_the_same_patient(tmp_path, reference, name):
     if name == "massless":  # the inertia of a massless body is ignored, so zeros give the same
         (tmp_path / "JW.osim").write_text(massless(original(), "0 0 0 0 0 0"), encoding="utf-8")
         reference = imported(tmp_path / "JW.osim", tmp_path / "zero")
-    ours, theirs = (
+    text, reference_text = (
         re.sub(r'"[^"]*shared', '"shared', path.read_text(encoding="utf-8"))
         for path in (scene, reference)
     )
-    assert ours == theirs
+    assert text == reference_text
     urdfs = [path.with_name("patient.urdf").read_bytes() for path in (scene, reference)]
     assert urdfs[0] == urdfs[1]
 

@@ -41,7 +41,7 @@ def change(group, key, value):
     return f"() => tkamb.bench.change('{group}', '{key}', {value}, false)"
 
 
-def test_a_knee_object_has_a_page_without_frames(page):
+def test_the_page_of_a_knee_object_has_no_frames(page):
     assert page.problems == []
     assert page.evaluate("() => document.getElementById('pose-frame')") is None
     assert page.evaluate("() => tkamb.bench.answer.request.load_N") == 800.0
@@ -57,12 +57,12 @@ def test_a_key_moves_a_slider_and_the_fine_model_is_computed(page):
     assert page.evaluate("() => document.getElementById('mark').className") == ""
 
 
-def test_a_failed_state_shows_its_reason_and_the_last_numbers_in_grey(page):
-    good = state_after(page, change("pose", "ap_mm", 0.0))
-    assert not good["stale"]
+def test_a_failed_state_shows_its_reason_and_the_last_valid_numbers_in_grey(page):
+    central = state_after(page, change("pose", "ap_mm", 0.0))
+    assert not central["stale"]
     dislocated = state_after(page, change("pose", "ap_mm", 55.0))
     assert dislocated["stale"] and "does not lie over the insert" in dislocated["mark"]
-    assert (dislocated["shown"], dislocated["request"]) == (good["shown"], good["request"])
+    assert (dislocated["shown"], dislocated["request"]) == (central["shown"], central["request"])
     beyond = state_after(page, change("pose", "ap_mm", 70.0))
     assert beyond["stale"] and "-60 to 60" in beyond["mark"]
     page.forgive("400")

@@ -46,7 +46,7 @@ def test_forces_are_nan_in_gaps_and_outside_the_measurement(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"offset_s": 100.0}, "measured from 100 to 104 s, the motion lasts from 0 to 1 s"),
+        ({"offset_s": 100.0}, "measured from 100 to 104 s, but the motion lasts from 0 to 1 s"),
         ({"columns": {"total": "A"}}, "no column 'A'"),
     ],
 )

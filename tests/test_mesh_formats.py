@@ -200,7 +200,7 @@ def test_bytes_after_the_last_triangle_are_ignored_with_a_notice(tail, tmp_path,
     with caplog.at_level(logging.WARNING, "tkamb"):
         surface = load_surface(path, "mm", name="insert", closed=True)
     assert surface.volume == pytest.approx(plate().volume, rel=1e-6)
-    assert f"{len(tail)} bytes after the last triangle left out" in caplog.text
+    assert f"{len(tail)} bytes after the last triangle are ignored" in caplog.text
 
 
 @pytest.mark.parametrize("count", [0, 2**32 - 1])
@@ -211,7 +211,7 @@ def test_an_stl_with_a_wrong_number_of_triangles_is_read(count, tmp_path, caplog
     with caplog.at_level(logging.WARNING, "tkamb"):
         surface = load_surface(path, "mm", name="insert", closed=True)
     assert surface.volume == pytest.approx(plate().volume, rel=1e-6)
-    assert "does not say how many triangles" in caplog.text
+    assert "does not state its number of triangles" in caplog.text
 
 
 def test_solids_one_after_the_other_are_all_read(tmp_path):

@@ -1,4 +1,4 @@
-"""A run opens only the files and imports only the modules that its scene requires."""
+"""A run opens only the files and imports only the modules that its scene needs."""
 
 import json
 import subprocess
@@ -73,7 +73,7 @@ def test_without_contact_no_mesh_is_read_and_no_contact_imported(tmp_path):
     assert "tkamb.knee.ligaments" in record["modules"]
 
 
-def test_without_ligaments_no_ligament_module(tmp_path):
+def test_without_ligaments_no_ligament_module_is_imported(tmp_path):
     record = traced_run(write_scene(tmp_path, ("ligament",)))
     assert "tkamb.knee.ligaments" not in record["modules"]
     assert "tkamb.contact.foundation" in record["modules"]

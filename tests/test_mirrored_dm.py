@@ -18,7 +18,7 @@ from tkamb import load_scene, simulate
 
 MODEL = Path(__file__).parents[1] / "models" / "dm"
 DATA = Path(__file__).parents[2] / "shared" / "data" / "dm"
-FEW = {
+OVERRIDES = {
     "motion.frames": 11,
     "motion.cutoff_Hz": 3.0,
     "ground_reaction.cutoff_Hz": 3.0,
@@ -35,10 +35,10 @@ needs_dm = pytest.mark.skipif(
 
 @pytest.mark.slow
 @needs_dm
-def test_mirrored_dm_is_the_same_knee(tmp_path):
+def test_mirrored_dm_gives_the_same_results(tmp_path):
     """All columns agree to 0.1 % of their largest value, in stance and swing."""
-    right = simulate(load_scene(MODEL / "scene.toml", FEW), frames=FRAMES)
-    left = simulate(load_scene(write_mirrored_dm(tmp_path), FEW), frames=FRAMES)
+    right = simulate(load_scene(MODEL / "scene.toml", OVERRIDES), frames=FRAMES)
+    left = simulate(load_scene(write_mirrored_dm(tmp_path), OVERRIDES), frames=FRAMES)
     assert left["status"] == right["status"]
     assert np.isfinite(right["force_total_N"]).any()
     names = [n for n in right.columns if n not in (*TIMES, "status")]
@@ -85,7 +85,7 @@ def write_mirrored_dm(folder):
 
 
 def _mirror_points(table):
-    """Reflect every point of the scene in place: keys that end in _mm, with three numbers."""
+    """Reflect every point of a table in place: values of three numbers under keys `..._mm`."""
     for key, value in table.items():
         if isinstance(value, dict):
             _mirror_points(value)
@@ -134,7 +134,7 @@ def _negated(cell):
 
 
 def _write_stl(path, corners):
-    kind = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
+    kind = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     rows = np.zeros(len(corners), kind)
     rows["corners"] = corners
     path.write_bytes(bytes(80) + np.uint32(len(rows)).tobytes() + rows.tobytes())

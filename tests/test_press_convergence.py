@@ -8,15 +8,15 @@ from inserts import DATA
 from tkamb.cli import main
 
 JW_ALIGNED = ("jw", "0.00192979 0 0 0 0 0")
-"""Pose with aligned components, 0 deg of flexion, centred on the dishes of the insert."""
+"""Subject and pose: aligned components at 0 deg of flexion, centred on the insert's dishes."""
 DM_STANCE = ("dm", "-0.0065 0.041674 0.00014 -0.2406 2.9164 -9.9867")
-"""Recorded pose at 30 % of the gait cycle."""
+"""Subject and recorded pose at 30 % of the gait cycle."""
 DM_PRESSED_WIDE = ("dm", "-0.00616 0.041501 -0.000712 -1.1287 2.67 -9.8262")
-"""Pose at 24 %: the contact at the edge of the lateral condyle is several cells wide."""
+"""Subject and recorded pose at 24 %: the lateral contact at an edge is several cells wide."""
 
 
 def pressed(capsys, subject, pose, size, *flags):
-    """Return the result of the command for 2500 N."""
+    """Return the result of the command for 2500 N and cells of `size` mm."""
     folder = DATA / subject / "geometry"
     if not folder.is_dir():
         pytest.skip("subject data absent (shared/data): meshes of DM and JW are not shipped")
@@ -50,7 +50,7 @@ def test_jw_converges_with_its_peak_pressure(capsys):
 def test_facets_leave_no_pattern_in_the_pressure_and_no_flag(capsys):
     """The surface is smoothed over JW's facets, which are 2.7 mm long.
 
-    On the facets themselves, the peaks are 24.4 and 25.3 MPa, and 31 MPa with cells of 0.75 mm.
+    Without smoothing, the peaks are 24.4 and 25.3 MPa, and 31 MPa with cells of 0.75 mm.
     """
     coarse, fine = (pressed(capsys, *JW_ALIGNED, size) for size in (2.0, 1.5))
     assert coarse["flags"] == []
@@ -76,5 +76,8 @@ def test_dm_converges_with_its_peak_pressure_in_a_wide_contact(capsys):
 
 
 def test_a_peak_pressure_at_an_edge_is_flagged(capsys):
-    """DM's flat condyles press with their edges. From 1 to 0.75 mm the peak rises by 12 %."""
+    """DM's flat condyles press with their edges.
+
+    With cells of 0.75 instead of 1 mm, the peak is 12 % larger.
+    """
     assert "lateral peak pressure lies at an edge" in pressed(capsys, *DM_STANCE, 2.0)["flags"][0]

@@ -27,16 +27,16 @@ def test_the_scene_of_the_page_gives_the_results_of_the_starter(tmp_path):
     written = re.findall(r"^`(\S+)`:\n\n```\w+\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
     assert len(written) == 4
     overrides = {"ligament": [], "contact.model": "foundation", "contact.resolution_mm": 2.0}
-    first = slice(0, 6, 5)
+    frames = slice(0, 6, 5)
     started = tkamb.simulate(
-        tkamb.load_scene(tmp_path / "knee" / "scene.toml", overrides), frames=first
+        tkamb.load_scene(tmp_path / "knee" / "scene.toml", overrides), frames=frames
     )
     for name, text in written:
         (tmp_path / "knee" / name).write_text(text, encoding="utf-8")
-    of_page = tkamb.simulate(tmp_path / "knee" / "scene.toml", frames=first)
+    of_page = tkamb.simulate(tmp_path / "knee" / "scene.toml", frames=frames)
     for name in ("ground_reaction_ap_N", "ground_reaction_si_N", "force_total_BW"):
         np.testing.assert_allclose(of_page[name], started[name], rtol=1e-3)
-    # The recorded patella of the starter was solved on finer meshes.
+    # The starter's patella motion was solved on finer meshes.
     np.testing.assert_allclose(of_page["quadriceps_N"], started["quadriceps_N"], rtol=3e-3)
     assert "Nobody was measured" not in str(of_page.summary["notes"])
 

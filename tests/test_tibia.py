@@ -190,7 +190,7 @@ def test_contradictory_marker_tables_are_refused(tmp_path):
             marker_table(file, markers_mm={**MARKERS, "uper": (0, 0, 0)}), AT, "right", "none"
         )
     stretched = {name: tuple(np.array(p) * 3) for name, p in MARKERS.items()}
-    with pytest.raises(InputError, match="shank markers fit only to"):
+    with pytest.raises(InputError, match="shank markers have a residual of"):
         load_tibia(marker_table(file, markers_mm=stretched), AT, "right", "none")
     with pytest.raises(InputError, match=r"covers -?0\.0000 to 2\.0000 s, but"):
         load_tibia(marker_table(file), AT + 1, "right", "none")

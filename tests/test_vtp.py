@@ -125,8 +125,8 @@ def test_a_file_cut_short_anywhere_is_refused(mode, packed, tmp_path):
     [
         ('type="PolyData"', 'type="UnstructuredGrid"', "it is UnstructuredGrid"),
         ('NumberOfPolys="', 'NumberOfStrips="2" NumberOfPolys="', "strips"),
-        ('NumberOfPolys="', 'NumberOfPolys="1', "not as announced"),
-        ('NumberOfPoints="', 'NumberOfPoints="1', "not as announced"),
+        ('NumberOfPolys="', 'NumberOfPolys="1', "not as stated"),
+        ('NumberOfPoints="', 'NumberOfPoints="1', "not as stated"),
         ("byte_order", 'compressor="vtkLZ4DataCompressor" byte_order', "vtkLZ4DataCompressor"),
         ('Name="offsets"', 'Name="ends"', "offsets"),
         ('format="ascii"', 'format="text"', "format 'text'"),

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 COLLECTED_AT = (20_000, 100)
 """Thresholds of Python's garbage collector: new objects before a collection, and collections before
-older objects are included. Python's defaults (700 and 10) search the objects of the libraries
-five times, which takes 3 % of a run."""
+older objects are included. Python's defaults (700 and 10) cause five searches of the libraries'
+objects, which take 3 % of a run."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -54,10 +54,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _keep_to_one_thread() -> None:
-    """Limit BLAS to one thread, unless the environment sets a number or NumPy is loaded already.
+    """Limit BLAS to one thread, unless the environment sets a number or NumPy is already loaded.
 
-    Memory bandwidth limits the solves of the lattice. More threads wait for each other, which takes
-    several times longer on a busy machine.
+    Memory bandwidth limits the lattice's solver. On a busy machine, several threads wait for each
+    other and take several times longer.
     """
     limits = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     if "numpy" not in sys.modules and not any(name in os.environ for name in limits):

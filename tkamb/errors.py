@@ -9,7 +9,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class MessageSettings:
-    """The length of messages."""
+    """Limit on the length of messages."""
 
     max_names: int = 8
     """Largest number of names in a message. Chosen because a message should be short."""
@@ -73,7 +73,7 @@ def not_installed(package: str, where: object, extra: str) -> InputError:
 
 
 def names_near(name: str, names: Iterable[str], title: str = "there are") -> str:
-    """Return a hint: "did you mean ..." with similar names, then the first of `names`."""
+    """Return a hint: "did you mean ..." with similar names, then the first few of `names`."""
     all_names = list(names)
     lower = {each.lower(): each for each in all_names}
     close = difflib.get_close_matches(name.lower(), lower, n=4, cutoff=0.6)

@@ -153,7 +153,7 @@ def read_xml(
     """Return the root element of an XML file.
 
     Raises:
-        InputError: as `read_bytes`, or the content is not XML, declares entities (they can grow
+        InputError: as `read_bytes`, or the content is not XML, declares entities (which can grow
             without end or name other files) or nests elements too deeply.
     """
     return parse_xml(read_bytes(path, limit, what=what), path, what=what)
@@ -168,7 +168,7 @@ def parse_xml(content: bytes, path: str | Path, *, what: str = "file") -> Elemen
     builder = _ShallowBuilder(path)
 
     def refuse_entity(name: str, *_: object) -> None:
-        hint = "write its text out"
+        hint = "replace the entity by its text"
         raise InputError(f"declares an entity '{name}', which is refused", path, hint)
 
     parser = expat.ParserCreate()
@@ -227,7 +227,7 @@ _NAMED = re.compile(rb'<\w+[^<>]*?\sfile="([^"<>]+)"')
 
 
 def named_files(path: Path) -> list[Path]:
-    """Return the files that an XML file refers to by file="…", and the files that these refer to.
+    """Return the files that an XML file names by file="…", and in turn the files that these name.
 
     Args:
         path: an OpenSim model. Its sets may be separate files.
@@ -403,7 +403,7 @@ class Replacement:
         written = {name: path.name for name, path in self._written.items()}
         journal = {"written": written, "removed": self._removed}
         write_text(self.folder / JOURNAL, json.dumps(journal))
-        self._written.clear()  # now the journal lists them
+        self._written.clear()  # from now on the journal lists them
         finish_replacement(self.folder)
 
     def discard(self) -> None:
@@ -461,8 +461,8 @@ def finish_replacement(folder: Path) -> None:
             (folder / name).unlink(missing_ok=True)
         journal.unlink(missing_ok=True)
     except OSError as error:
-        what = f"results could not be put in their places ({_reason(error)})"
-        raise InputError(what, folder, "`tkamb verify` on the folder finishes it") from None
+        what = f"results could not be renamed ({_reason(error)})"
+        raise InputError(what, folder, "finish with `tkamb verify` on the folder") from None
 
 
 def claim_directory(path: str | Path) -> Path:

@@ -1,4 +1,4 @@
-"""Test of a contact model against the contract of contact models.
+"""Check that a contact model fulfils the contract of contact models.
 
     from tkamb.testing import check_contact_model
     check_contact_model(MyModel(resolution=1e-3))
@@ -21,16 +21,18 @@ from tkamb.geometry.frames import Array, inverse, knee_pose
 from tkamb.geometry.surface import Surface
 
 SPHERE_RADIUS, SPHERE_OFFSET = 20e-3, 12e-3
+"""m: radius of the two spheres, and distance of their centres from the sagittal plane."""
 BLOCK = (32e-3, 10e-3, 56e-3)
+"""m: lengths of the block along x, y and z."""
 
 
 @dataclass(frozen=True)
 class ModelCheckSettings:
-    """Tolerances of the test."""
+    """Tolerances of the check."""
 
     stiffness_tolerance: float = 0.1
-    """1: largest relative difference of the stiffnesses over 10 and 5 % of the approach. Chosen
-    because the force has small steps when single nodes come into contact."""
+    """1: largest relative difference between the stiffnesses over ±10 and ±5 % of the approach.
+    Chosen because the force has small steps when single nodes come into contact."""
 
 
 MODEL_CHECK = ModelCheckSettings()
@@ -42,7 +44,7 @@ class ConformanceError(TkambError):
 
 @dataclass(frozen=True, eq=False)
 class ConformanceCase:
-    """The bodies, pose, load and tolerances of a test.
+    """The bodies, pose, load and tolerances of the check.
 
     Args:
         pair: the two bodies.
@@ -114,7 +116,9 @@ def two_sphere_pair() -> ContactPair:
 
 def _require(holds: Any, what: str, detail: str = "") -> None:
     if not holds:
-        raise ConformanceError(f"{what}{': ' if detail else ''}{detail}", "contact model")
+        raise ConformanceError(
+            f"not fulfilled: {what}{': ' if detail else ''}{detail}", "contact model"
+        )
 
 
 def _close(a: Any, b: Any, tolerance: float, scale: float) -> bool:
@@ -136,7 +140,7 @@ def _check_apart(model: ContactModel, state: Any, case: ConformanceCase) -> None
     result = model.evaluate(state, case.pair.pose_at_approach(case.pose, -1e-3))
     _require(result.status is ContactStatus.OK, what, f"status {result.status.value}")
     _require((result.wrench_on_insert == 0).all() and (result.pressure == 0).all(), what)
-    _require(result.medial is None and result.lateral is None, what, "a condyle carries")
+    _require(result.medial is None and result.lateral is None, what, "a condyle carries force")
     _require(result.approach == 0, what, f"approach {result.approach}")
     _require((result.gap > 0).all(), "gaps are positive when apart")
 
@@ -176,7 +180,7 @@ def _check_map(state: Any, pressed: ContactResult) -> None:
         _require(getattr(pressed, name).shape == (n, 3), f"'{name}' is (n, 3) on the map's points")
     for name in ("pressure", "area", "gap"):
         _require(getattr(pressed, name).shape == (n,), f"'{name}' is (n,) on the map's points")
-    _require(np.array_equal(pressed.points, state.points), "the map's points stay")
+    _require(np.array_equal(pressed.points, state.points), "the map's points do not change")
     _require(np.asarray(state.triangles).max() < n, "triangles join the map's points")
     _require((pressed.pressure >= 0).all(), "pressure is not negative")
     _require((pressed.area > 0).all(), "tributary areas are positive")
@@ -210,15 +214,15 @@ def _check_femoral_frame(
 ) -> None:
     """Check that the result does not depend on the frame of the femoral mesh.
 
-    The contract fixes the insert frame, so that this is equivalent to moving both bodies together.
-    The other frame is rotated about z, so that medial and lateral stay.
+    The insert frame is fixed, so that this is equivalent to moving both bodies together. The other
+    frame is rotated about z, so that medial and lateral do not change.
     """
     other = knee_pose([3e-3, -5e-3, 0.5e-3, 0.0, 0.0, np.radians(25)])
     pair = ContactPair(
         case.pair.femoral.moved(other), case.pair.insert, case.pair.material, case.pair.bearing
     )
     result = model.press(model.prepare(pair), case.load, case.pose @ inverse(other))
-    what = "both bodies moved together change nothing"
+    what = "moving both bodies together changes nothing"
     _require(_close(result.approach, pressed.approach, case.tolerance, pressed.approach), what)
     _require(
         _close(
@@ -256,7 +260,7 @@ def _check_stiffness(
 def _check_guess(
     model: ContactModel, state: Any, case: ConformanceCase, pressed: ContactResult
 ) -> None:
-    what = "a guess changes no answer"
+    what = "an initial guess does not change the result"
     peak = pressed.pressure.max()
     for share in (0.2, 3.0):
         for guess in model.press_from(state, share * case.load, case.pose):

@@ -1,4 +1,4 @@
-"""Factors from units of files to SI. Inside the package all values are in SI and radians."""
+"""Factors from units of files to SI. Inside the package, values are in SI and angles in radians."""
 
 import math
 

@@ -4,7 +4,7 @@ Frame k of the file is at the time (first frame + k)/rate. The first frame is co
 that a trial cut out of a longer one keeps its times. A marker with a negative residual, or at
 exactly (0, 0, 0), is missing in that frame: a gap.
 
-Markers, channels and each plate are read separately. A fault in one of them is stored, and raised
+Markers, channels and each plate are read separately. An error in one part is stored, and raised
 only when that part is used.
 
 Format: C3D user guide, https://www.c3d.org.
@@ -54,7 +54,7 @@ class Recording:
         channels: name -> (k,) samples of each channel that belongs to no plate, like EMG.
         channel_units: name -> unit, as in the file.
         plates: the readable force plates, in the file's order.
-        faults: part, like "markers", "channels" or "plate 2" -> its error.
+        faults: name of an unreadable part ("markers", "channels", "plate 2") -> its error.
         equal_channels: names that several channels share.
         notices: remarks on contradictions in the file.
         length_word: the file's word for its unit of length.
@@ -97,10 +97,10 @@ class Recording:
     def all_notices(self) -> tuple[str, ...]:
         """Remarks on the file and its plates, and on parts that could not be read."""
         plate_notices = [notice for plate in self.plates for notice in plate.notices]
-        parts: dict[str, list[str]] = {}
+        parts: dict[str, list[str]] = {}  # message of an error -> the parts that it concerns
         for part, error in self.faults.items():
             parts.setdefault(error.what, []).append(part)
-        unread = [f"not used: {', '.join(part)}: {what}" for what, part in parts.items()]
+        unread = [f"not used: {', '.join(names)}: {what}" for what, names in parts.items()]
         return (*self.notices, *plate_notices, *unread)
 
     def plate(self, number: int) -> ForcePlate:
@@ -118,7 +118,7 @@ class Recording:
         raise InputError(
             f"has no force plate {number}",
             self.path,
-            f"give [ground_reaction] plates, of {numbers}",
+            f"choose [ground_reaction] plates from: {numbers}",
         )
 
     def channel(self, name: str) -> Array:
@@ -147,7 +147,7 @@ def read_c3d(path: str | Path, units: GivenUnits | None = None) -> Recording:
 
     Args:
         path: the file.
-        units: units that the file does not state, or for which it has unknown words.
+        units: the user's units; None: those of the file.
 
     Raises:
         InputError: no such file, not a regular file, not C3D, cut short, no valid frame rate, or
@@ -171,7 +171,7 @@ def _read(path: Path, changed: int, units: GivenUnits) -> Recording:
 
 @dataclass(frozen=True, eq=False)
 class _Reader:
-    """Reads each part of a recording separately. `faults` has the errors of unreadable parts."""
+    """Reader of the parts of a recording. `faults` has the errors of unreadable parts."""
 
     path: Path
     file: C3dFile
@@ -349,7 +349,8 @@ class _Reader:
     def _per_plate(self, key: str, rows: tuple[int, ...] | None) -> Array | None:
         """Return a parameter's numbers, in the shape `rows` per plate; the last index is the plate.
 
-        The file may lack the last index if it has one plate. None: missing or of another size.
+        The file may lack the last index if it has one plate. None: the parameter is missing, or its
+        size does not fit.
         """
         value = self._parameters.numbers(f"FORCE_PLATFORM:{key}")
         if value is None or not value.size:

@@ -7,7 +7,7 @@ A file begins with a header of 512 bytes. Its parameter section is a chain of re
 or a parameter with type, dimensions and values. Its data section holds frame after frame: four
 words per marker (x, y, z, residual and cameras), then the analog samples of that frame, channel
 by channel. Words are 16-bit integers if the scale is positive, and 32-bit floats if it is
-negative. Their number format is that of the machine that wrote the file.
+negative. Byte order and float format are those of the machine that wrote the file.
 
 Format: C3D user guide, https://www.c3d.org.
 """
@@ -25,7 +25,8 @@ from tkamb.geometry.frames import Array
 BLOCK = 512
 """Bytes of a block. The format counts positions in blocks."""
 LARGEST_16_BIT = 65535
-"""Largest frame number that the header can hold. TRIAL has the numbers of longer recordings."""
+"""Largest frame number that the header can hold. Longer recordings state theirs in
+TRIAL."""
 EXPORT = "export the trial again as C3D"
 MOST_DIMENSIONS = 7
 """Largest number of dimensions of a parameter, by the format."""
@@ -41,7 +42,7 @@ class Header:
 
     Args:
         markers: number of markers.
-        analog: analog values per frame.
+        analog: analog values per frame, of all channels.
         samples: analog samples of a channel per frame.
         first: number of the first frame, from 1.
         last: number of the last frame.
@@ -73,7 +74,7 @@ class Parameters:
         path: the file, for messages.
         values: "GROUP:NAME" -> array of numbers (the first index runs fastest in the file), or
             list of texts.
-        damaged: names of the parameters with a record shorter than its dimensions state.
+        damaged: names of the parameters whose record cannot be read.
     """
 
     path: Path
@@ -347,7 +348,8 @@ class _Data:
         frames must fit the size of the file from exactly one of the two blocks.
 
         Raises:
-            InputError: no block is within the file, or the frames fit from neither or from both.
+            InputError: no stated block lies within the file, or the frames fit from neither block
+                or from both.
         """
         stated = self.parameters.integers("POINT:DATA_START")
         blocks = list(dict.fromkeys([self.header.data_block, *stated[:1]]))

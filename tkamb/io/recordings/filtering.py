@@ -12,7 +12,7 @@ second derivatives belong to one smooth curve. Polynomials of degree two pass un
 The ends are natural; samples are not padded. Example: a 1 Hz wave with a cut-off of 6 Hz. The root
 mean square error of its acceleration, as a share of the amplitude, is 0.23 at an end. At a distance
 of a quarter, a half and one period of the cut-off it is 0.06, 0.013 and 0.002. A two-pass
-Butterworth filter with reflected ends has errors of 0.64, 0.16, 0.11 and 0.02.
+Butterworth filter with reflected ends has errors of 0.64, 0.16, 0.11 and 0.02 at these places.
 
 `periodic=True` closes the curve: the last sample is the first one of the next cycle, and there are
 no ends.

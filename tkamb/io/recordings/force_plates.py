@@ -13,8 +13,8 @@ channels give the force and the moment about the transducers' origin in these ax
     type 5   as type 2 after a calibration matrix (6, 8) of eight channels
 
 A calibration matrix gives forces in N (or FORCE_PLATFORM:UNITS) and moments in that unit times
-POINT:UNITS. The channels of a type 4 plate may state other units. Then those units are used that
-put the centre of pressure on the plate.
+POINT:UNITS. The channels of a type 4 plate may state other units. The units that put the centre of
+pressure on the plate are then used.
 
 ORIGIN is the vector o from the transducers' origin to the centre of the surface. The moment about
 this centre is M - o × F. The centre of pressure is not returned: it needs a force threshold.
@@ -52,7 +52,7 @@ class PlateSettings:
     """N: largest mean vertical force over the frames of ZERO that is drift of the amplifier. Chosen
     because a foot exerts more."""
     baseline_share: float = 0.2
-    """1: the same limit as a share of the largest change of the vertical force; the larger limit
+    """1: as `baseline_N`, but a share of the largest change of the vertical force; the larger limit
     holds. Chosen because a standing person exerts more."""
     loaded_N: float = 100.0
     """N: vertical force above which the centre of pressure is checked. Chosen because a smaller
@@ -80,8 +80,8 @@ class PlateRecord:
         calibration: (6, c), matrix from channels to force and moment (types 4 and 5), or None.
         force_unit: unit of the calibrated forces.
         metres_per_unit: metres per unit of length of the file.
-        zero: samples that the file states as unloaded, or None.
-        given: units that the user states.
+        zero: samples in which the file states the plate as unloaded, or None.
+        given: the user's units.
         where: file and plate, for messages.
     """
 
@@ -140,10 +140,10 @@ def force_plate(record: PlateRecord) -> ForcePlate:
     """
     kind, where = record.kind, record.where
     if kind not in CHANNELS:
-        raise InputError(f"is of type {kind}", where, "types 1 to 5 are read")
+        raise InputError(f"is of type {kind}", where, "use a plate of type 1 to 5")
     if len(record.signals) < CHANNELS[kind]:
-        have = f"has {len(record.signals)} of {CHANNELS[kind]} channels"
-        raise InputError(have, where, "export again")
+        what = f"has {len(record.signals)} of {CHANNELS[kind]} channels"
+        raise InputError(what, where, "export the trial again")
     if not np.isfinite(record.signals).any():
         raise InputError("holds no value that is a number", where, "export the trial again")
     axes = _axes(record.corners, where)
@@ -169,7 +169,7 @@ def force_plate(record: PlateRecord) -> ForcePlate:
 
 
 def _loaded_in_zero(record: PlateRecord, force: Array) -> str:
-    """Return the reason not to subtract the mean over the frames of ZERO; "": there is none."""
+    """Return the reason not to subtract the mean over the frames of ZERO, or ""."""
     assert record.zero is not None
     vertical = force[:, 2]
     window = vertical[record.zero]

@@ -31,7 +31,7 @@ GAIT = GaitSettings()
 
 @dataclass(frozen=True, eq=False)
 class Gait:
-    """Stances of a foot from its force plates.
+    """Stances of one foot, from its ground reaction.
 
     Args:
         stances: (n, 2) s, foot strike and toe-off of each stance; NaN if the recording begins or
@@ -121,7 +121,7 @@ def _crossing(time: Array, vertical: Array, after: int) -> float:
 
 @dataclass(frozen=True)
 class Cycle:
-    """A cycle recorded over per cent, on an interval of time.
+    """A motion over per cent of a gait cycle, assigned to an interval of time.
 
     Args:
         start: start of the interval, s.
@@ -143,10 +143,10 @@ class Cycle:
         offset_percent: float,
         path: Path,
     ) -> "Cycle":
-        """Return the cycle of the scene.
+        """Return the cycle of a recorded motion.
 
-        It is closed if it was recorded to 100 % and the coordinates at 100 % and 0 % differ by
-        no more than their largest step between neighbouring samples.
+        The cycle is closed if it was recorded from 0 to 100 %, and the coordinates at its ends
+        differ by no more than their largest step between neighbouring samples.
 
         Args:
             percent: (n,) recorded per cent of the cycle.
@@ -156,8 +156,8 @@ class Cycle:
             path: the file, for messages.
 
         Raises:
-            InputError: `percent` is not per cent, the interval does not rise, or a cycle with an
-                offset is not closed.
+            InputError: `percent` is outside 0 to 100 or spans less than 2, the interval does not
+                rise, or a cycle with an offset is not closed.
         """
         start, end = interval
         if not start < end:
@@ -184,11 +184,16 @@ class Cycle:
         return self.start + (percent - self.offset_percent) / 100.0 * self.period
 
     def percent(self, time: Array) -> Array:
-        """Return per cent (n,) of the cycle at times (n,) s, rising from the offset."""
+        """Return per cent (n,) of the cycle at times (n,) s; not wrapped at 100 %."""
         return self.offset_percent + (time - self.start) / self.period * 100.0
 
     def frames(self, sampled: Array, count: int | None) -> Array:
-        """Return the times of the frames: `count` evenly spaced times, or the recorded times."""
+        """Return the times (f,) s of the frames.
+
+        Args:
+            sampled: (n,) s, recorded times.
+            count: number of evenly spaced frames; None: the frames are the recorded times.
+        """
         if not self.closed:
             return np.linspace(sampled[0], sampled[-1], count) if count else sampled
         if count:
@@ -199,7 +204,10 @@ class Cycle:
         return self.start + np.append(np.unique(np.round(elapsed, 12)), self.period)
 
     def wrapped(self, at: Array, sampled: Array) -> Array:
-        """Return times inside the recorded cycle that differ from `at` by whole periods."""
+        """Return times inside the recorded cycle that differ from `at` by whole periods.
+
+        Unless the cycle is closed and has an offset, times outside are moved to its ends.
+        """
         if not self.closed or not self.offset_percent:
             return np.clip(at, sampled[0], sampled[-1])
         return np.clip(sampled[0] + np.mod(at - sampled[0], self.period), sampled[0], sampled[-1])

@@ -6,9 +6,9 @@ at the plate's level h:
 
     x = (M_z + h F_x) / F_y,   z = (h F_z - M_x) / F_y,   T_y = M_y - (z F_x - x F_z)
 
-Below `unloaded_N` of vertical force the point is interpolated linearly in time between the
-loaded frames on either side, and the moment is the moment about that point. The filtered wrench
-does not change; only its reference point is a convention.
+While the vertical force is below `unloaded_N`, the point is interpolated linearly in time between
+the loaded samples before and after. The moment is then about this point. The wrench itself does
+not change.
 """
 
 from dataclasses import dataclass, field, replace
@@ -31,7 +31,7 @@ from tkamb.io.recordings.unit_words import GivenUnits
 from tkamb.units import MILLIMETRE
 
 DIRECTIONS = ("forward", "upward", "rightward")
-"""Names of the laboratory's axes in messages. The axes of a file may be others."""
+"""Names of the laboratory's axes in messages. A file may have other axes."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class GroundReactionSettings:
     """How a measured ground reaction is read and checked."""
 
     level_tolerance: float = 0.01
-    """m: largest change of height of the centre of pressure on a level plate. Chosen because
-    rounding is smaller."""
+    """m: largest change of height of the centre of pressure on a level plate, and largest height
+    between plates. Chosen because rounding is smaller."""
     window: float = 0.5
     """s: time before and after the frames in which samples are searched for odd values. Chosen
     because the filter's response is several times shorter."""
@@ -59,11 +59,11 @@ free moment, and more than moments about a plate's origin."""
 ODD_FORCE, LEAST_ODD_FORCE, ODD_POINT = 0.05, 0.01, 5e-3
 """Smallest deviations of an odd sample from the curve of its neighbours. ODD_FORCE: share of the
 component's peak. LEAST_ODD_FORCE: share of the largest component's peak; the larger limit holds.
-ODD_POINT: m, for a point."""
+ODD_POINT: m, of the centre of pressure."""
 ODD_SHARE_LEFT = 0.1
 """1: a spike is reported if more than this share of the smallest odd deviation remains after the
-low-pass. Smaller spikes change results by at most 0.5 % of the peak. Example: of one sample of 76 N
-at 1200 Hz, 0.8 N remain at a cut-off of 6 Hz."""
+low-pass filter. Smaller spikes change results by at most 0.5 % of the peak. Example: of one sample
+of 76 N at 1200 Hz, 0.8 N remain at a cut-off of 6 Hz."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +79,7 @@ class GroundReaction:
         level_assumed: whether the plate's height is assumed to be 0, because no column states it.
         drift: number of a plate -> vertical force of the unloaded plate, N, if it is large.
         notices: remarks on the parts of the file that were used.
-        gait: stances of the recording; None without a recording.
+        gait: stances in the recording; None if not computed.
     """
 
     force: Array
@@ -227,7 +227,7 @@ def _units(source: GroundReactionTable) -> GivenUnits:
 def _complete_part(
     recorded: RecordedReaction, time: Array, source: GroundReactionTable
 ) -> RecordedReaction:
-    """Return the longest part around the frames in which all values are finite.
+    """Return the longest part around the frames with only finite values.
 
     Raises:
         InputError: a value among the frames is not finite.
@@ -259,7 +259,7 @@ def _read_table(source: GroundReactionTable) -> RecordedReaction:
     """Return the ground reaction of a table. The height of the points is zero without a column."""
     if source.surface_mm:
         raise InputError(
-            "is for plates of a .c3d: a table states its points itself",
+            "is for plates of a .c3d; a table states its points itself",
             "[ground_reaction] surface_mm",
             "leave it out",
         )
@@ -342,7 +342,7 @@ def _read_columns(source: GroundReactionTable, recorded: Table) -> tuple[Array, 
     rotation = laboratory_rotation(source.laboratory_axes, recorded.path)
     roles_present = {role for role in roles if role in source.columns or role in recorded.columns}
     columns = []
-    # Without point columns, all three moments must be there: they are about the file's origin.
+    # Without point columns, the moments are about the file's origin, and all three are needed.
     without_points = (
         not any(role.startswith("point") for role in roles_present) and len(roles_present) == 6
     )
@@ -367,9 +367,9 @@ def _read_columns(source: GroundReactionTable, recorded: Table) -> tuple[Array, 
 def _check_size(path: Path, kind: str, column: str, values: Array) -> None:
     """Raise an InputError if a column (n,) holds larger values than a foot exerts."""
     largest, unit = LARGEST[kind]
-    question = f"check whether a cell is mistyped, and whether the {kind} is in {unit}"
+    hint = f"check whether a cell is mistyped, and whether the {kind} is in {unit}"
     filled = np.where(np.isfinite(values), values, 0.0)  # gaps are checked later
-    check_range(path, f"foot: column '{column}'", filled, (-largest, largest), unit, question)
+    check_range(path, f"foot: column '{column}'", filled, (-largest, largest), unit, hint)
 
 
 def _read_plates(source: GroundReactionTable) -> RecordedReaction:
@@ -386,13 +386,17 @@ def _read_plates(source: GroundReactionTable) -> RecordedReaction:
         raise InputError(
             "holds several force plates" if numbers else "holds no force plate",
             source.file,
-            f"give [ground_reaction] plates, of {', '.join(map(str, numbers)) or 'none'}",
+            f"choose [ground_reaction] plates from: {', '.join(map(str, numbers)) or 'none'}",
         )
     plates = [recording.plate(number) for number in dict.fromkeys(source.plates)]
     rotation = laboratory_rotation(source.laboratory_axes, source.file)
     levels = [float((rotation @ plate.centre)[1]) for plate in plates]
     if np.ptp(levels) > GROUND_REACTION.level_tolerance:
-        raise InputError("the plates lie at different levels", source.file, "give them one by one")
+        raise InputError(
+            "the plates lie at different levels",
+            source.file,
+            "use one plate, or plates at one level",
+        )
     wrenches, drift = [], {}
     for plate in plates:
         in_file = source.sign * plate.wrench
@@ -449,7 +453,7 @@ def _centre_of_pressure(force: Array, about_origin: Array, level: float) -> Arra
 
 
 def _check_upward(force: Array, source: GroundReactionTable) -> None:
-    """Raise if the largest force on the foot points down or sideways."""
+    """Raise an InputError if the largest force on the foot points down or sideways."""
     up, down = float(force[:, 1].max()), float(-force[:, 1].min())
     aside = float(np.hypot(force[:, 0], force[:, 2]).max())
     if max(down, aside) > max(up, source.unloaded_N):

@@ -82,10 +82,10 @@ class NormalEquations:
 
 
 class MarkerChain(Protocol[State]):
-    """Interface of a chain with n degrees of freedom and m markers that is fitted to markers."""
+    """A chain with n degrees of freedom and m markers, to be fitted to measured markers."""
 
     def places(self, state: State) -> Array:
-        """Return the markers (f, m, 3) m."""
+        """Return the positions (f, m, 3) m of the chain's markers."""
 
     def normal(self, state: State, target: Array, weights: Array) -> NormalEquations:
         """Return the normal equations for measured markers (f, m, 3) m with weights (f, m)."""
@@ -106,8 +106,8 @@ class ChainFit(Generic[State]):
 
     Args:
         state: the fitted state.
-        rms: (f,) m, root mean square distance of the visible markers; NaN without markers.
-        distance: (f, m) m, distance of each marker; NaN for a missing one.
+        rms: (f,) m, root mean square of `distance`; NaN without markers.
+        distance: (f, m) m, from each measured marker to the chain's; NaN for a missing marker.
         solved: (f,) whether the last step was below `INVERSE_KINEMATICS.step_tolerance`.
         steps: number of iterations.
     """
@@ -132,12 +132,14 @@ def fit_chain(
     """
     visible = np.isfinite(measured).all(axis=2)
     target, frame_weights = np.nan_to_num(measured), np.where(visible, weights, 0.0)
-    damping, last = np.full(len(measured), 1e-6), np.full(len(measured), np.inf)
+    damping, last_size = np.full(len(measured), 1e-6), np.full(len(measured), np.inf)
     active, steps = np.arange(len(measured)), 0
     state, residual = start, chain.normal(start, target, frame_weights)
     while steps < INVERSE_KINEMATICS.max_iterations:
         step = _step(
-            residual.of(active), damping[active], last[active] < INVERSE_KINEMATICS.newton_below
+            residual.of(active),
+            damping[active],
+            last_size[active] < INVERSE_KINEMATICS.newton_below,
         )
         trial = chain.moved(chain.chosen(state, active), step)
         size = np.abs(step).max(axis=1)
@@ -156,7 +158,7 @@ def fit_chain(
         state = chain.replaced(state, accepted, chain.chosen(trial, rows))
         residual = residual.replaced(accepted, trial_residual.of(rows))
         damping[active] = np.clip(damping[active] * np.where(better, 0.1, 10.0), 1e-12, 1e6)
-        last[active] = np.where(better, size, np.inf)
+        last_size[active] = np.where(better, size, np.inf)
     distance = np.where(visible, np.linalg.norm(chain.places(state) - target, axis=2), np.nan)
     count = visible.sum(axis=1)
     rms = np.sqrt(np.nansum(distance**2, axis=1) / np.maximum(count, 1))
@@ -210,13 +212,12 @@ class Segment:
     """A body with markers.
 
     Args:
-        name: "shank", "thigh", or the name of a neighbour of one of them.
+        name: "shank", "thigh", or the name of a neighbouring segment.
         labels: (m) labels of its markers.
         points: (m, 3) m, its markers in its frame.
         weights: (m,) weights of the markers' squared distances.
         joined_to: of a neighbour: the segment, "shank" or "thigh", to which a ball joint connects
             it. Empty for shank and thigh.
-
         joint: (3,) m, the ball joint in the frame of `joined_to`.
         centre: (3,) m, the ball joint in the neighbour's frame.
     """
@@ -280,7 +281,7 @@ class LegChain:
         return poses
 
     def start(self, fitted: dict[str, Array], neutral: Array) -> LegState:
-        """Return an initial guess from the fits of the single segments.
+        """Return an initial guess from the separate fits of the segments.
 
         Args:
             fitted: segment -> (f, 4, 4) pose in the world; NaN in frames without a fit.
@@ -303,7 +304,7 @@ class LegChain:
         return state
 
     def places(self, state: LegState) -> Array:
-        """Return the markers (f, m, 3) m."""
+        """Return the positions (f, m, 3) m of the chain's markers."""
         return self.markers(state)[0]
 
     def normal(self, state: LegState, target: Array, weights: Array) -> NormalEquations:
@@ -320,7 +321,7 @@ class LegChain:
         )
 
     def markers(self, state: LegState) -> tuple[Array, Array]:
-        """Return the markers (f, m, 3) m and their Jacobian (f, m, 3, n)."""
+        """Return the chain's marker positions (f, m, 3) m and their Jacobian (f, m, 3, n)."""
         poses, places, blocks = self.poses(state), [], []
         for segment in self.segments.values():
             x = transform(poses[segment.name], segment.points[None])

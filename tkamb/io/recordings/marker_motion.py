@@ -2,8 +2,8 @@
 
 The same markers are fitted in two ways. Both fits are computed, and the scene chooses one:
 
-- segments: shank and thigh are fitted rigidly and separately. Each gives a knee centre. The
-  distance between the two shows the movement of the skin.
+- segments: shank and thigh are fitted rigidly and separately. Each segment gives a knee
+  centre. The distance between the two centres shows the movement of the skin.
 - chain: shank, knee, thigh and their neighbours are fitted at once, connected by joints. The
   movement of the skin is distributed over the segments.
 
@@ -48,7 +48,7 @@ class MarkerMotionSettings:
     """The motion of a leg from markers."""
 
     max_joint_gap: float = 0.1
-    """m: largest distance between the positions of a joint by the markers of its two segments.
+    """m: largest distance between two positions of one joint, each by the markers of one segment.
     Chosen because skin at the hip moves by a third of this, and the other foot is farther away."""
 
 
@@ -143,7 +143,7 @@ def both_fits(
 ) -> tuple[dict[str, tuple[Array, Array]], ChainFit[LegState]]:
     """Return the separate fits and the fit of the chain.
 
-    A separate fit is segment -> (poses (n, 4, 4) m, root mean square distances (n,) m).
+    The separate fits are segment -> (poses (n, 4, 4) m, root mean square distances (n,) m).
     """
     fits = {s.name: fit_seen(measured[s.name], s.points, s.weights, s.name) for s in segments}
     _check_fits({name: fit[1] for name, fit in fits.items()}, recorded)
@@ -207,14 +207,14 @@ def _check_fits(rms: dict[str, Array], recorded: Table) -> None:
             )
         if len(finite) and np.median(finite) > MARKER_FIT.max_median_residual:
             raise InputError(
-                f"markers of the {name} fit only to {np.median(finite) / MILLIMETRE:.0f} mm",
+                f"markers of the {name} have a residual of {np.median(finite) / MILLIMETRE:.0f} mm",
                 recorded.path,
                 "check names and positions in [motion.markers], and length_unit",
             )
 
 
 def _check_joints(segments: list[Segment], poses: dict[str, Array], recorded: Table) -> None:
-    """Raise if the markers of two segments give distant positions of their common joint."""
+    """Raise an InputError if two segments' markers give distant positions of their joint."""
     for segment in segments:
         name, neighbour = segment.name, segment.joined_to
         if segment.joint is None or segment.centre is None:
@@ -223,8 +223,8 @@ def _check_joints(segments: list[Segment], poses: dict[str, Array], recorded: Ta
         distance = np.linalg.norm(ends, axis=1)
         if np.isfinite(distance).any() and np.nanmedian(distance) > MARKER_MOTION.max_joint_gap:
             raise InputError(
-                f"markers of the {name} put its joint with the {neighbour} "
-                f"{np.nanmedian(distance) / MILLIMETRE:.0f} mm from where the {neighbour}'s do",
+                f"markers of the {name} and of the {neighbour} give positions of their joint that "
+                f"are {np.nanmedian(distance) / MILLIMETRE:.0f} mm apart",
                 recorded.path,
                 "check the labels in [motion.markers]; left and right may be swapped",
             )
@@ -245,17 +245,17 @@ def _compare_readings(
     `readings` and `rms` have both methods: poses of shank and thigh, and residuals.
     """
     assert source.markers is not None
-    used = source.markers.method
-    knees = {name: _knee(low @ chain.insert, high) for name, (low, high) in readings.items()}
+    method = source.markers.method
+    knees = {name: _knee(shank @ chain.insert, thigh) for name, (shank, thigh) in readings.items()}
     missing = np.concatenate(
         [np.isnan(measured[name]).any(axis=2) for name in KNEE_SEGMENTS], axis=1
     )
-    run = _run(time, np.isnan(knees[used][:, 0]), source.interval_s, recorded)
+    run = _run(time, np.isnan(knees[method][:, 0]), source.interval_s, recorded)
     return MarkerKinematics(
         time[run],
-        used,
-        readings[used][0][run],
-        knees[used][run],
+        method,
+        readings[method][0][run],
+        knees[method][run],
         {name: knee[run, FLEXION] for name, knee in knees.items()},
         {name: values[run] for name, values in rms.items()},
         np.linalg.norm(knees["segments"][run, :3] - neutral[:3], axis=1),

@@ -18,7 +18,7 @@ from tkamb.units import MILLIMETRE
 
 @dataclass(frozen=True)
 class MarkerFitSettings:
-    """Check of a fit of markers."""
+    """Check of the rigid fit of a body to its markers."""
 
     max_median_residual: float = 0.05
     """m: largest median residual. Chosen because soft tissue causes less; a larger residual is due
@@ -29,7 +29,7 @@ MARKER_FIT = MarkerFitSettings()
 
 
 def plain_label(label: str) -> str:
-    """Return a label in lower case, without the subject's prefix and . _ - and blanks."""
+    """Return a label in lower case, without the subject's prefix, blanks and . _ -"""
     name = label.rpartition(":")[2]
     return "".join(c for c in name if c not in "._- ").lower()
 
@@ -72,13 +72,13 @@ def marker_trajectories(table: Table, names: list[str], metres_per_unit: float) 
 def shank_points(source: TibiaTable, recorded: Table) -> tuple[Array, Array]:
     """Return the shank's markers and joint centres, as measured and in the tibia link's frame.
 
-    A joint centre comes from a rigid fit of the neighbouring segment's markers.
+    A joint centre is found by a rigid fit of the neighbouring segment's markers.
 
     Returns:
         Points (n, m, 3), m, in the file's axes, gaps NaN; reference points (m, 3), m.
 
     Raises:
-        InputError: no unit, a missing marker, or a poor fit of the neighbour's markers.
+        InputError: no unit of length, a missing marker, or a poor fit of the neighbour's markers.
     """
     scale = recorded.unit_scale(source.length_unit, "length_unit")
     points = [marker_trajectories(recorded, [name], scale) for name in source.markers_mm]
@@ -98,7 +98,7 @@ def check_fit(residual: Array, what: str, recorded: Table) -> None:
     finite = residual[np.isfinite(residual)]
     if len(finite) and np.median(finite) > MARKER_FIT.max_median_residual:
         raise InputError(
-            f"{what} fit only to {np.median(finite) / MILLIMETRE:.0f} mm",
+            f"{what} have a residual of {np.median(finite) / MILLIMETRE:.0f} mm",
             recorded.path,
             "check names and positions in [tibia], and length_unit",
         )

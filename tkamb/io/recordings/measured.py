@@ -8,7 +8,7 @@ each frequency f by
     1 / (1 + r⁴),  r = tan(pi f h) / tan(pi f_c h),
 
 and the high-pass by r⁴ / (1 + r⁴). The signal is mirrored at its ends, so that the low-pass also
-averages there. Negative values of the envelope are set to zero.
+averages at the ends. Negative values of the envelope are set to zero.
 
 Reference: Winter, Biomechanics and Motor Control of Human Movement, 4th ed., 2009, ch. 10.
 """
@@ -57,8 +57,8 @@ class MeasuredForce:
     def at(self, time: Array) -> dict[str, Array]:
         """Return the forces (f,) N at times (f,) s, by linear interpolation.
 
-        They are NaN outside the measurement, next to a gap, and between samples that are farther
-        apart than `max_gap`.
+        The forces are NaN outside the measurement, next to a gap, and between samples that are
+        farther apart than `max_gap`.
         """
         step = np.diff(self.time)
         right = np.clip(np.searchsorted(self.time, time), 1, len(self.time) - 1)
@@ -101,7 +101,7 @@ def _sum(table: Table, column: str | dict[str, float]) -> Array:
 
 
 def _with_third(force: dict[str, Array]) -> dict[str, Array]:
-    """Add the third force if two are known, from total = medial + lateral."""
+    """Return the forces with the third added if two are known, from total = medial + lateral."""
     if set(force) == {"medial", "lateral"}:
         return {"total": force["medial"] + force["lateral"], **force}
     for side, other in (("medial", "lateral"), ("lateral", "medial")):
@@ -112,7 +112,7 @@ def _with_third(force: dict[str, Array]) -> dict[str, Array]:
 
 @dataclass(frozen=True)
 class EmgSettings:
-    """Envelopes of a recorded EMG."""
+    """Computation of the envelopes of EMG."""
 
     filter_order: int = 2
     """Order of each Butterworth filter in one direction. Chosen because forwards and backwards
@@ -178,8 +178,10 @@ def load_envelopes(source: EmgTable, motion: Array) -> Envelopes:
             raise InputError(
                 error.what, f"{source.file}: channel '{channel}'", error.hint
             ) from None
-        by = result.max() if source.normalised_by == "recording" else source.normalised_by[channel]
-        normalised_by[channel] = float(by)
+        divisor = (
+            result.max() if source.normalised_by == "recording" else source.normalised_by[channel]
+        )
+        normalised_by[channel] = float(divisor)
         if not result.max() > EMG.flat_share * np.abs(signal).max():
             raise InputError(f"channel '{channel}' holds no signal", source.file, "leave it out")
         values[channel] = result / normalised_by[channel]

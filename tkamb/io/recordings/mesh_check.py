@@ -23,11 +23,11 @@ from tkamb.units import LENGTH
 
 @dataclass(frozen=True)
 class MeshUnitSettings:
-    """Guesses of unit and bottom of a mesh, and the length of the report."""
+    """Guesses of a mesh's unit and bottom, and the length of the report."""
 
     typical_size: float = 0.08
-    """m: assumed length of a mesh of which the unit cannot be guessed. Chosen because it is that of
-    a component of a knee."""
+    """m: assumed length of a mesh whose unit cannot be guessed. Chosen because a knee component has
+    this length."""
     min_size_share: float = 0.12
     """1: smallest area of a flat side in the report, as a share of the mesh's area. Chosen because
     the bottom of an insert is larger."""
@@ -40,7 +40,7 @@ MESH_UNIT = MeshUnitSettings()
 
 @dataclass(frozen=True)
 class Hole:
-    """A loop of open edges: number of edges, width and centre, in file units."""
+    """A loop of open edges: number of edges; width and centre in file units."""
 
     edges: int
     width: float
@@ -49,7 +49,7 @@ class Hole:
 
 @dataclass(frozen=True)
 class FlatSide:
-    """A large flat side: the mesh axis that it faces, its share of the mesh's area, its tilt."""
+    """A large flat side: the mesh axis that it faces (like "-y"), share of the area, and tilt."""
 
     faces: str
     area_share: float
@@ -58,7 +58,7 @@ class FlatSide:
 
 @dataclass(frozen=True)
 class Part:
-    """A separate body: number of triangles, extents and centre in file units, whether closed."""
+    """A separate body: number of triangles; extents and centre in file units; whether closed."""
 
     triangles: int
     extents: tuple[float, ...]
@@ -92,7 +92,7 @@ class MeshHealth:
         remaining_holes: holes that loading would not close.
         forks: number of vertices at which three or more sheets meet in an edge.
         one_sided: whether no winding of the triangles is consistent.
-        units: guess of the unit: units in which the size is that of a part of a knee.
+        units: plausible units: those in which the mesh has the size of a part of a knee.
         flats: the largest flat sides. The first is probably the bottom of an insert.
     """
 
@@ -174,7 +174,7 @@ class MeshHealth:
 
     def _unit_question(self) -> str:
         if not self.units:
-            return f"in no unit of {', '.join(LENGTH)} is this the size of a part of a knee"
+            return f"not the size of a part of a knee in any of {', '.join(LENGTH)}"
         names = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "inch": "inches"}
         return " or ".join(f"{names[unit]}? then pass --units {unit}" for unit in self.units)
 

@@ -40,8 +40,8 @@ class MeshFileSettings:
     """m: a mesh with coarser rounding of coordinates is refused. Chosen because 8 µm change forces
     by 4 %."""
     sheet_opening: float = 1.0 / 3.0
-    """1: widest hole of a part, as a share of its length; with a wider hole it is an open sheet.
-    Chosen because holes of damaged files are smaller."""
+    """1: widest hole of a part, as a share of its length. A part with a wider hole is an open
+    sheet. Chosen because holes of damaged files are smaller."""
 
 
 MESH_FILE = MeshFileSettings()
@@ -118,7 +118,9 @@ def load_surface(
     """
     rotation = axes_rotation(axes)
     if unit not in LENGTH:
-        raise InputError(f"unknown unit '{unit}' of {name}", path, f"one of {', '.join(LENGTH)}")
+        raise InputError(
+            f"unknown unit '{unit}' of {name}", path, f"use one of {', '.join(LENGTH)}"
+        )
     vertices, faces = read_triangles(path)
     _check_size(vertices[faces.reshape(-1)], unit, path, name, size)
     _check_rounding(vertices[faces.reshape(-1)], unit, path, name)
@@ -231,9 +233,9 @@ def describe_holes(holes: tuple[BoundaryLoop, ...], unit: str) -> str:
     return text if more == 0 else f"{text}, and {more} more"
 
 
-_NO_TRIANGLES = "holds no triangles; it is cut short or no mesh: export it again"
+_NO_TRIANGLES = "holds no triangles: it is cut short, or not a mesh"
 _FORMATS = "give an STL, OBJ, PLY or VTP file of triangles"
-_CLOSE = "close it in a mesh editor; holes up to about a lattice cell (2 mm) are closed for you"
+_CLOSE = "close it in a mesh editor; holes up to about a lattice cell (2 mm) are closed on loading"
 
 
 def _opposite(names: list[str]) -> str:
@@ -250,7 +252,7 @@ def _without_inner_wall(mended: Repair, unit: str) -> tuple[Repair, InnerWall | 
     where = ", ".join(f"{round(value / LENGTH[unit], 2) + 0.0:g}" for value in wall.centre)
     words = f"inner wall of {1e6 * wall.area:.0f} mm² at ({where}) {unit} between touching bodies"
     if wall.without is None:
-        return replace(mended, notices=(*mended.notices, f"{words} does not count")), wall
+        return replace(mended, notices=(*mended.notices, f"{words} is ignored")), wall
     vertices, faces = wall.without
     notices = (*mended.notices, f"{words} removed")
     return replace(mended, vertices=vertices, faces=faces, notices=notices), None
@@ -259,7 +261,7 @@ def _without_inner_wall(mended: Repair, unit: str) -> tuple[Repair, InnerWall | 
 def _check_part(
     mended: Repair, path: str | Path, name: str, right: Array, wall: InnerWall | None
 ) -> None:
-    """Raise if a part is an open sheet, like a contact surface, or several bodies.
+    """Raise an InputError if a part is an open sheet, like a contact surface, or several bodies.
 
     Bodies that touch or overlap at an inner wall count as one.
     """
@@ -291,9 +293,9 @@ def _check_part(
 
 
 def _two_condyles(bodies: list[Body], right: Array) -> bool:
-    """Return whether the bodies are two of similar size, side by side along `right` (3,).
+    """Return whether there are two bodies of similar size, side by side along `right` (3,).
 
-    This holds for the two components of a bicompartmental knee. A tray and an insert lie one above
+    These are the two components of a bicompartmental knee. A tray and an insert lie one above
     the other, and parts of both legs are farther apart than their widths.
     """
     if len(bodies) != 2:
@@ -328,7 +330,7 @@ def _check_size(
 
 
 def _check_knee_width(surface: Surface, path: str | Path) -> None:
-    """Raise if a component with two condyles is smaller than any person's knee."""
+    """Raise an InputError if a component with two condyles is smaller than any person's knee."""
     extents = np.ptp(surface.bounds, axis=0)
     if extents.max() < MESH_FILE.min_size and condyle_split(surface) is not None:
         raise InputError(
@@ -340,7 +342,7 @@ def _check_knee_width(surface: Surface, path: str | Path) -> None:
 
 
 def _check_rounding(corners: Array, unit: str, path: str | Path, name: str) -> None:
-    """Warn or raise if coordinates (n, 3), far from the origin, are rounded too coarsely."""
+    """Warn, or raise an InputError, if coordinates (n, 3) are rounded too coarsely."""
     rounding = coordinate_rounding(corners) * LENGTH[unit]
     if rounding <= MESH_FILE.rounding_notice:
         return
@@ -351,7 +353,7 @@ def _check_rounding(corners: Array, unit: str, path: str | Path, name: str) -> N
     )
     if rounding > MESH_FILE.rounding_limit:
         raise InputError(
-            words, path, "move it to the origin where it was made, and export it again"
+            words, path, "move the part to the origin in the CAD program, and export it again"
         )
     _log.warning("%s: %s", path, words)
 
@@ -360,7 +362,7 @@ def coordinate_rounding(corners: Array) -> float:
     """Return the step to which coordinates (n, 3) are rounded, in their unit; 0: none is detected.
 
     Single precision and text of six or seven digits are detected, axis by axis. If more than half
-    of the coordinates are multiples of several steps, they are round numbers and have lost nothing.
+    of an axis's coordinates are multiples of four or five steps, they are exact round numbers.
     """
     return max((_axis_rounding(values) for values in corners.T), default=0.0)
 
@@ -392,7 +394,9 @@ def _check_surface(mended: Repair, path: str | Path, name: str, unit: str) -> No
         raise InputError(f"{name} is not a surface: it has only one side", path, _REMESH)
     if len(mended.faces) < 4:
         raise InputError(
-            f"{name} is not a surface: {len(mended.faces)} triangles left", path, _REMESH
+            f"{name} is not a surface: {len(mended.faces)} triangles remain after repair",
+            path,
+            _REMESH,
         )
     if len(mended.forks):
         point = mended.vertices[mended.forks[0]] / LENGTH[unit]

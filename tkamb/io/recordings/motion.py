@@ -1,7 +1,7 @@
 """The knee's recorded motion: read, converted to knee coordinates, filtered, resampled.
 
 Recorded angles of any sequence are converted to the six coordinates of Grood and Suntay through the
-rotation matrix. A left knee is mirrored here: the medial-lateral translation changes its sign. The
+rotation matrix. A left knee is mirrored: the medial-lateral translation changes its sign. The
 clinical angles and the patella's sagittal coordinates keep their signs.
 """
 
@@ -60,10 +60,10 @@ class PatellaMotionSettings:
 PATELLA_MOTION = PatellaMotionSettings()
 
 FASTEST = {"turn": 100.0, "move": 10.0}
-"""rad/s and m/s: largest speeds, five times that of the fastest kick and above the noise of a
+"""rad/s and m/s: largest speeds, five times those of the fastest kick and above the noise of a
 recording."""
 ODD = {"turn": 0.5 * DEGREE, "move": 0.5 * MILLIMETRE}
-"""rad and m: smallest deviation of an odd sample from its neighbours' curve, the error of
+"""rad and m: smallest deviation of an odd sample from its neighbours' curve: the error of
 fluoroscopy."""
 
 
@@ -83,7 +83,7 @@ class KneeMotion:
         patella_velocity: (f, 3) its first derivative.
         patella_acceleration: (f, 3) its second derivative.
         cycle_percent: (f,) per cent of the cycle, if the motion is a cycle.
-        closed_cycle: whether the cycle's ends agree and it is filtered as periodic.
+        closed_cycle: whether the cycle's ends agree, so that the filter is periodic.
         unrecorded: coordinates without a column; they are zero.
         odd: samples off their neighbours' curve.
         markers: kinematics by skin markers, if the motion comes from markers.
@@ -152,8 +152,10 @@ def load_motion(
         if side == "left":
             knee[:, KNEE_COORDINATES.index("ml")] *= -1.0
     _check_knee(knee, recorded.path, _bending_role(recorded, source))
-    named = [c for c in PATELLA_COORDINATES if c in source.columns or c in recorded.columns]
-    patella = _read_coordinates(recorded, source, PATELLA_COORDINATES) if named else None
+    patella_columns = [
+        c for c in PATELLA_COORDINATES if c in source.columns or c in recorded.columns
+    ]
+    patella = _read_coordinates(recorded, source, PATELLA_COORDINATES) if patella_columns else None
     if patella is not None:
         _check_patella(patella, recorded.path)
     motion = _differentiate(time, knee, patella, source, recorded.path)
@@ -171,9 +173,9 @@ def _from_markers(
     unrecorded = tuple(name for name in KNEE_COORDINATES if name not in names)
     if needed := [name for name in unrecorded if name not in released]:
         raise InputError(
-            f"nothing gives {', '.join(needed)}",
+            f"coordinates lack {', '.join(needed)}",
             "[motion.markers]",
-            "add it to coordinates, or release it: [contact] released",
+            "add them to coordinates, or release them: [contact] released",
         )
     result = load_marker_motion(source, side, insert)
     knee = result.coordinates.copy()
@@ -262,36 +264,34 @@ def _bending_role(recorded: Table, source: MotionTable) -> str:
 
 
 def _check_knee(knee: Array, path: Path, bending: str | None = None) -> None:
-    """Raise if knee coordinates (n, 6) are impossible.
+    """Raise an InputError if knee coordinates (n, 6) are impossible.
 
-    `bending` is the role of the column with the sign of flexion, or None.
+    `bending` is the role of the column that shows flexion, or None.
     """
     for i, name in enumerate(KNEE_COORDINATES):
         if name in LIMITS_DEG:
-            question = "check [motion] columns, sequence, angle_unit and the meshes' axes"
+            hint = "check [motion] columns, sequence, angle_unit and the meshes' axes"
             values, limits, unit = knee[:, i] / DEGREE, LIMITS_DEG[name], "deg"
             low, high = limits
             is_flexion = name == "flexion" and bending is not None
             if is_flexion and values.min() < low <= -values.max() and -values.min() <= high:
-                question = (
-                    f'if bending is negative in it, set [motion] signs_turned = ["{bending}"]'
-                )
+                hint = f'if bending is negative in it, set [motion] signs_turned = ["{bending}"]'
         else:
-            question = "check [motion] columns, length_unit and where the meshes have their origin"
+            hint = "check [motion] columns, length_unit and the origins of the meshes"
             values, limits, unit = knee[:, i] / MILLIMETRE, FARTHEST_MM, "mm"
-        check_range(path, f"knee: {name}", values, limits, unit, question)
+        check_range(path, f"knee: {name}", values, limits, unit, hint)
 
 
 def _check_patella(patella: Array, path: Path) -> None:
-    """Raise if the patella's coordinates (n, 3) are far from the femoral component."""
+    """Raise an InputError if the patella's coordinates (n, 3) are impossible."""
     turn = (-PATELLA_MOTION.max_rotation_deg, PATELLA_MOTION.max_rotation_deg)
     for name, values, limits, unit, key in (
         ("patella_ap", patella[:, 0] / MILLIMETRE, FARTHEST_MM, "mm", "length_unit"),
         ("patella_si", patella[:, 1] / MILLIMETRE, FARTHEST_MM, "mm", "length_unit"),
         ("patella_rotation", patella[:, 2] / DEGREE, turn, "deg", "angle_unit"),
     ):
-        question = f"check [motion] columns, {key}, and whether a cell is mistyped"
-        check_range(path, f"knee: {name}", values, limits, unit, question)
+        hint = f"check [motion] columns, {key}, and whether a cell is mistyped"
+        check_range(path, f"knee: {name}", values, limits, unit, hint)
 
 
 def _find_odd_steps(time: Array, values: Array, path: Path) -> tuple[OddSample, ...]:

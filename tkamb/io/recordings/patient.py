@@ -115,13 +115,13 @@ class PatellaLinkSettings:
     """The patella's inertia if the URDF states none, and a check of the axes of the links."""
 
     mass: float = 0.1
-    """kg: mass of the patella, at its link's origin, if the URDF states none. An assumption."""
+    """kg: mass of the patella, at its link's origin, if the URDF states none (assumed)."""
     radius_of_gyration: float = 0.015
     """m: radius of gyration of this mass about any axis. Chosen because it is about that of a disc
     of 40 mm diameter and 20 mm thickness."""
     max_lateral_share: float = 0.5
-    """1: largest distance of a link's other end from the link's y axis (up), as a share of the
-    link's length. Chosen because a link with a larger distance is not along its y axis."""
+    """1: largest distance of a link's far end from the link's y axis (up), as a share of the link's
+    length. Chosen because a link with a larger distance does not lie along its y axis."""
 
 
 PATELLA_LINK = PatellaLinkSettings()
@@ -132,7 +132,7 @@ THIGH = (0.2, 0.7)
 tall adult."""
 
 SHANK = (0.15, 0.65)
-"""m: accepted distances from the ankle centre to the insert's bottom, from a child to a very tall
+"""m: accepted distances from the ankle centre to the insert frame, from a child to a very tall
 adult."""
 
 MOST_TURNED = np.radians(40.0)
@@ -148,7 +148,7 @@ def load_urdf(patient: PatientTable, with_patella: bool) -> str:
         with_patella: whether the patella and its joints are needed.
 
     Raises:
-        InputError: a missing file, link or joint, a wrong axis, or a singular inertia.
+        InputError: a missing file, link or joint, a wrong axis, or an impossible inertia.
     """
     path = patient.urdf
     robot = _parse(path)
@@ -211,7 +211,7 @@ def _mirror(robot: ElementTree.Element) -> None:
 
 
 def _check_places(robot: ElementTree.Element, path: Path) -> None:
-    """Raise unless hip and insert lie at plausible distances above the knee and the ankle."""
+    """Raise an InputError unless hip and insert lie plausibly above the knee and the ankle."""
     joints = {joint.get("name"): joint for joint in robot.findall("joint")}
     checks = (
         ("the hip", "femur", _fixed_pose(robot, "hip", "femur", path)[:3, 3], THIGH),
@@ -228,7 +228,7 @@ def _check_places(robot: ElementTree.Element, path: Path) -> None:
             raise InputError(
                 f"{name} is at ({words}) m in '{link}', {distance:.4g} m from its origin",
                 path,
-                f"it must lie {low:g} to {high:g} m above it, along y, in metres",
+                f"place it {low:g} to {high:g} m above this origin, along y, in metres",
             )
     turn = _origin(joints["knee_ap"])[:3, :3]
     if min(turn[0, 0], turn[1, 1]) < np.cos(MOST_TURNED):

@@ -20,7 +20,7 @@ from tkamb.files import FILE_LIMITS, read_bytes
 from tkamb.geometry.frames import Array, Index
 
 Polygons = tuple[Array, Index, Index]
-"""Vertices (n, 3), corners of all polygons (m,), and where each polygon ends (p,)."""
+"""Vertices (n, 3), vertex indices of all corners (m,), and where each polygon ends in them (p,)."""
 
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
@@ -69,7 +69,7 @@ def read_obj(path: str | Path) -> Polygons:
 
 @dataclass(frozen=True)
 class _Element:
-    """A kind of element of a PLY file: its name, the number of items and their properties.
+    """A kind of element of a PLY file: name, number of items, and their properties.
 
     A property has a name, a type and, if it is a list, the type of the list's length (else "").
     """
@@ -134,7 +134,7 @@ def _ply_header(content: bytes) -> tuple[str, list[_Element], int]:
                 more = (*last.properties, (words[-1], _TYPES[kinds[1]], _TYPES.get(kinds[0], "")))
                 elements[-1] = _Element(last.name, last.count, more)
             else:
-                raise ValueError(f"property type '{' '.join(words[1:-1])}'")
+                raise ValueError(f"unknown property type '{' '.join(words[1:-1])}'")
         elif words[:1] == ["end_header"]:
             if order is None:
                 raise ValueError("its format is none of ascii, binary_little_endian, _big_endian")
@@ -258,7 +258,7 @@ _log = logging.getLogger("tkamb")
 
 _HEADER = 84
 """Bytes before the first triangle: 80 bytes of header, and the number of triangles."""
-_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")])
+_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _TEXT_WITHIN = 2000
 """Bytes at the beginning of a text STL that contain its first facet."""
 
@@ -283,7 +283,7 @@ def read_binary_stl(path: Path) -> Array | None:
         count = int.from_bytes(content[position + 80 : position + _HEADER], "little")
         if position == 0 and count in (0, 2**32 - 1) and available >= _TRIANGLE.itemsize:
             count = available // _TRIANGLE.itemsize
-            _log.warning("%s: does not say how many triangles it has; %d are read", path, count)
+            _log.warning("%s: does not state its number of triangles; %d are read", path, count)
         if count == 0 or count * _TRIANGLE.itemsize > available:
             break
         solids.append(np.frombuffer(content, _TRIANGLE, count, position + _HEADER)["corners"])
@@ -294,7 +294,9 @@ def read_binary_stl(path: Path) -> Array | None:
         _refuse_cut_short(content, path)
         return None
     if position < len(content):
-        _log.warning("%s: %d bytes after the last triangle left out", path, len(content) - position)
+        _log.warning(
+            "%s: %d bytes after the last triangle are ignored", path, len(content) - position
+        )
     return np.concatenate(solids).reshape(-1, 3).astype(np.float64)
 
 
@@ -318,7 +320,7 @@ def _another_solid(content: bytes, position: int) -> bool:
 
 
 def _refuse_cut_short(content: bytes, path: Path) -> None:
-    """Raise if a file states more triangles than it has, and those that it has are plausible."""
+    """Raise an InputError if a file has plausible triangles, but fewer than it states."""
     count = int.from_bytes(content[80:_HEADER], "little")
     stored = (len(content) - _HEADER) // _TRIANGLE.itemsize
     if not 0 < stored < count:

@@ -30,14 +30,14 @@ class PatientTable(SceneTable):
 
     urdf: Path
     side: Side = Field(description="the knee that is modelled")
-    # limits: a six-year-old child with a tumour prosthesis, the heaviest patients
+    # limits: from a six-year-old child with a tumour prosthesis to the heaviest patients
     mass_kg: Annotated[Number, within(20, 300, "give it in kilograms")] = Field(
         description="body mass, 20 to 300; forces in BW are relative to it"
     )
     sex: Literal["male", "female"] | None = Field(
         None, description="selects the de Leva table, for segments without <inertial>"
     )
-    # limits: the same child, very tall adults
+    # limits: from the same child to very tall adults
     height_mm: Annotated[
         Number | None, within(1000, 2300, "give the standing height in millimetres")
     ] = Field(None, description="body height, 1000 to 2300")
@@ -77,8 +77,8 @@ class MarkerSegmentTable(SceneTable):
         present = [v is not None for v in (self.joined_to, self.joint_mm, self.centre_mm)]
         if any(present) if knee else not all(present):
             raise ValueError(
-                "'joined_to', 'joint_mm' and 'centre_mm' go together, on every segment but "
-                "shank and thigh"
+                "a neighbour needs 'joined_to', 'joint_mm' and 'centre_mm'; shank and thigh have "
+                "none of them"
             )
         for name, weight in self.weights.items():
             if name not in self.markers_mm:
@@ -125,7 +125,7 @@ class MarkersTable(SceneTable):
         if missing := {"shank", "thigh"} - set(names):
             raise ValueError(f"segment '{min(missing)}' is missing")
         if "flexion" not in self.coordinates:
-            raise ValueError("'coordinates' lacks flexion, which nothing else gives")
+            raise ValueError("'coordinates' lacks flexion")
         return self
 
 
@@ -430,9 +430,11 @@ class EmgTable(SceneTable):
     @property
     def sentence(self) -> str:
         """A sentence on the computation and the use of the envelopes."""
-        first = "" if self.high_pass_Hz == "none" else f"high-passed at {self.high_pass_Hz:g} Hz, "
+        high_pass = (
+            "" if self.high_pass_Hz == "none" else f"high-passed at {self.high_pass_Hz:g} Hz, "
+        )
         by_recording = self.normalised_by == "recording"
-        by = "their largest values in that file" if by_recording else "given values"
+        divisors = "their largest values in that file" if by_recording else "given values"
         use = {
             "report": "they are only compared with the activations",
             "target": f"the cost holds {self.weight} (a - e)^2 for each",
@@ -440,6 +442,6 @@ class EmgTable(SceneTable):
         }[self.use]
         count = sum(map(len, self.channels.values()))
         return (
-            f"EMG envelopes of {count} muscles ({self.file.name}: {first}rectified, low-passed at "
-            f"{self.cutoff_Hz:g} Hz, over {by}): {use}."
+            f"EMG envelopes of {count} muscles ({self.file.name}: {high_pass}rectified, "
+            f"low-passed at {self.cutoff_Hz:g} Hz, over {divisors}): {use}."
         )

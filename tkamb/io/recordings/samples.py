@@ -2,7 +2,7 @@
 
 The deviation of a sample is its distance from the cubic through its two neighbours on either side.
 A sample is odd if its deviation exceeds `floor` and many times the median deviation around it.
-Noise is therefore not odd, because it raises the median. A single sample hardly changes it.
+Noise is therefore not odd: it raises the median, which a single odd sample hardly changes.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from tkamb.geometry.frames import Array
 
 @dataclass(frozen=True)
 class SampleSettings:
-    """How odd samples are recognized."""
+    """How odd samples are recognised."""
 
     neighbours: int = 12
     """Number of samples on either side for the median deviation. Chosen because they are enough for
@@ -85,12 +85,12 @@ def neighbours_curve(time: Array, values: Array) -> Array:
     first = np.clip(np.arange(n) - 2, 0, n - 5)
     others = first[:, None] + np.arange(5)
     others = others[others != np.arange(n)[:, None]].reshape(n, 4)
-    t, now = time[others], time[:, None]
+    t, sample_time = time[others], time[:, None]
     weights = np.ones((n, 4))
     for i in range(4):
         for j in range(4):
             if i != j:
-                weights[:, i] *= (now[:, 0] - t[:, j]) / (t[:, i] - t[:, j])
+                weights[:, i] *= (sample_time[:, 0] - t[:, j]) / (t[:, i] - t[:, j])
     return np.asarray((weights * values[others]).sum(axis=1))
 
 
@@ -124,10 +124,10 @@ def check_overlap(path: Path, clock: Array, time: Array, table: str) -> None:
     """
     if clock[-1] < time[0] or clock[0] > time[-1]:
         raise InputError(
-            f"was measured from {clock[0]:g} to {clock[-1]:g} s, the motion lasts from "
+            f"was measured from {clock[0]:g} to {clock[-1]:g} s, but the motion lasts from "
             f"{time[0]:g} to {time[-1]:g} s",
             path,
-            f"state {table} offset_s, or another file",
+            f"correct {table} offset_s, or use another file",
         )
 
 
@@ -149,9 +149,9 @@ def check_steps(
 
 
 def check_range(
-    path: Path, what: str, values: Array, limits: tuple[float, float], unit: str, question: str
+    path: Path, what: str, values: Array, limits: tuple[float, float], unit: str, hint: str
 ) -> None:
-    """Raise an InputError if values (n,) are outside `limits`, all in `unit`.
+    """Raise an InputError with a hint if values (n,) are outside `limits`, both in `unit`.
 
     `what` is the part of the body and the quantity, like "knee: flexion".
     """
@@ -163,5 +163,5 @@ def check_range(
             f"{quantity} runs from {values.min():.4g} to {values.max():.4g} {unit}, which no "
             f"{body} does ({low:g} to {high:g}; first in data row {int(np.argmax(outside)) + 1})",
             path,
-            question,
+            hint,
         )

@@ -53,7 +53,7 @@ def zero_or_within(low: float, high: float, hint: str) -> Any:
 
 
 HalfThickness = Annotated[Number, zero_or_within(0.2, 20, "give it in millimetres")]
-"""mm: distance of a tendon's centre line from the outline that it wraps; zero: a string."""
+"""mm: distance of a tendon's centre line from the outline that it wraps; zero: no thickness."""
 Band = Annotated[Number, zero_or_within(0.1, 50, "give it in millimetres")]
 """mm: distance up to which a tendon wraps sections beside its sagittal plane; zero: this plane
 only."""

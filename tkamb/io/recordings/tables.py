@@ -39,7 +39,7 @@ _NUMBER_CHARACTERS = "0123456789+-.eE "
 _INFINITE = re.compile(r"[+-]?inf(inity)?")
 _COMMA_NUMBER = re.compile(r"[+-]?[0-9]+,[0-9]+")
 STATED_DEGREES = {"yes": True, "true": True, "1": True, "no": False, "false": False, "0": False}
-"""Words that a storage file may have after `inDegrees=`."""
+"""Words after `inDegrees=` in a storage file -> whether angles are in degrees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,8 +181,8 @@ def with_unit(table: Table, length_unit: str | None) -> Table:
 def read_lines(path: Path) -> list[str]:
     """Return the lines of a text file.
 
-    The encoding is UTF-16 if the file begins with its byte order mark, else UTF-8. Other files are
-    read as Latin-1, which older programs write.
+    The encoding is UTF-16 if the file begins with that byte order mark, else UTF-8. If the bytes
+    are not valid UTF-8, it is Latin-1, which older programs write.
 
     Raises:
         InputError: no such file, or larger than a table may be.
@@ -375,7 +375,7 @@ def read_c3d_markers(path: Path) -> Table:
 
 
 def _exact_time(time: Array, frame: Array, rate: str) -> Array:
-    """Return evenly spaced times if the time column is their rounding; else return the column.
+    """Return evenly spaced times if the time column is these times rounded; else the column.
 
     The spacing follows from the rate (Hz). The offset is the best fit to the column.
     """
@@ -398,8 +398,8 @@ def _columns(
     values = np.empty((len(rows), len(names)))
     for k, (number, cells) in enumerate(rows):
         if len(cells) != len(names):
-            wrong = f"line {number} has {len(cells)} cells, the header {len(names)}"
-            raise InputError(wrong, path, _why_uneven(cells, names))
+            what = f"line {number} has {len(cells)} cells, the header {len(names)}"
+            raise InputError(what, path, _why_uneven(cells, names))
         values[k] = _row(cells, path, number)
     result = {name: values[:, k].copy() for k, name in enumerate(names) if counts[name] == 1}
     return result, tuple(sorted(name for name, count in counts.items() if count > 1))
@@ -425,8 +425,8 @@ def _number(cell: str, path: Path, line: int) -> float:
         return math.nan
     if not (_NUMBER.fullmatch(text) or _INFINITE.fullmatch(text.lower())):
         comma = "write a decimal point, not a comma" if _COMMA_NUMBER.match(text) else None
-        plain = comma or "write plain decimal numbers like -12.5"
-        raise InputError(f"line {line} holds '{text}', which is no number", path, plain)
+        hint = comma or "write plain decimal numbers like -12.5"
+        raise InputError(f"line {line} holds '{text}', which is no number", path, hint)
     number = float(text)
     if math.isinf(number):
         hint = "leave the cell empty where nothing was measured"

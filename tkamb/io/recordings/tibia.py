@@ -41,7 +41,7 @@ class TibiaPoseSettings:
     """m: largest distance from the laboratory's origin. Chosen because it is beyond the view of any
     camera."""
     shank_length: float = 0.4
-    """m: distance from the ankle of the second point that is checked. Chosen because it is about
+    """m: distance from the ankle to the proximal point that is checked. Chosen because it is about
     the length of an adult's shank."""
     window: float = 0.5
     """s: time before and after the frames in which samples are checked. Chosen because the filter's
@@ -83,8 +83,8 @@ class BodyMotion:
 def load_tibia(source: TibiaTable, time: Array, side: Side, cutoff_Hz: Cutoff) -> BodyMotion:
     """Return the tibia's motion at the frames of the knee's motion.
 
-    The recording is filtered before it is evaluated at the frames. If it is longer than the
-    interval, the errors of the filter at the ends are outside the interval.
+    The recording is filtered before it is evaluated at the frames. If it is longer than `time`, the
+    filter's errors at its ends are outside `time`.
 
     Args:
         source: the scene's [tibia].
@@ -118,22 +118,26 @@ def load_tibia(source: TibiaTable, time: Array, side: Side, cutoff_Hz: Cutoff) -
 
 
 def _odd_poses(recorded: Table, stamps: Array, poses: Array, time: Array) -> tuple[OddSample, ...]:
-    """Return the odd samples of the shank's two ends. Raise for impossible positions or speeds."""
+    """Return the odd samples of the shank's two ends.
+
+    Raises:
+        InputError: an impossible position or speed.
+    """
     near = (stamps >= time[0] - TIBIA_POSE.window) & (stamps <= time[-1] + TIBIA_POSE.window)
     ends = {
         "ankle": np.zeros(3),
-        "knee's end of the shank": np.array([0.0, TIBIA_POSE.shank_length, 0.0]),
+        "proximal end of the shank": np.array([0.0, TIBIA_POSE.shank_length, 0.0]),
     }
     odd: list[OddSample] = []
     for end, point in ends.items():
         places = transform(poses[near], point)
         for axis, values in zip("xyz", places.T, strict=True):
             what = f"{axis} of the {end}"
-            limits, question = (
+            limits, hint = (
                 (-TIBIA_POSE.max_distance, TIBIA_POSE.max_distance),
                 "check [tibia] columns and length_unit",
             )
-            check_range(recorded.path, f"shank: {what}", values, limits, "m", question)
+            check_range(recorded.path, f"shank: {what}", values, limits, "m", hint)
             series = (recorded.path, what, stamps[near], values)
             check_steps(*series, FASTEST_MOVE, MILLIMETRE, "mm")
             odd += odd_samples(*series, ODD_MOVE, MILLIMETRE, "mm")
@@ -149,8 +153,8 @@ def _sagittal(
     lean = recorded.complete_column(source.columns.get("angle", "angle"))
     lean = lean * angle_scale(recorded, source.angle_unit)
     limits = (-TIBIA_POSE.max_lean_deg, TIBIA_POSE.max_lean_deg)
-    question = "check [tibia] columns and angle_unit: it is the lean from the vertical"
-    check_range(recorded.path, "shank: angle", lean / DEGREE, limits, "deg", question)
+    hint = "check [tibia] columns and angle_unit: the angle is the lean from the vertical"
+    check_range(recorded.path, "shank: angle", lean / DEGREE, limits, "deg", hint)
     check_spacing(recorded.path, stamps)
     series = (recorded.path, "the shank's lean", stamps, lean)
     check_steps(*series, FASTEST_TURN, DEGREE, "deg")

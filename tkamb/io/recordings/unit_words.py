@@ -1,7 +1,7 @@
 """Unit words in recordings, like `N`, `nt`, `Newtons`, `N-mm`, `NMM`, `mete`, `Millimeters`.
 
-Case, blanks, dots, hyphens and asterisks are ignored. Only the words listed here are units. A
-reader raises an error for another word when it needs the quantity; no unit is guessed.
+Case, blanks, dots, hyphens and asterisks are ignored. Only the listed words are units. For another
+word, a reader raises an error when it needs the quantity. No unit is guessed.
 """
 
 from dataclasses import dataclass

@@ -1,7 +1,7 @@
 """Checks of a patient's URDF: numbers, one tree, the exact knee chain, physical inertias.
 
 Parsers of URDF silently ignore unknown attributes and fill in missing ones. A misspelt attribute
-becomes zero, and a joint without limits gets another type. Here these are errors.
+then becomes zero, and a joint without limits gets another type. These checks raise errors instead.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -67,24 +67,25 @@ _ANKLE_JOINT = "ankle"
 
 @dataclass(frozen=True)
 class UrdfAngleSettings:
-    """Which angles of a URDF are in radians."""
+    """Check that the angles of a URDF are in radians."""
 
     max_angle: float = 8.0 * np.pi
-    """rad: a larger number is in degrees. Chosen because angles in a URDF are below one turn."""
+    """rad: a larger angle is assumed to be in degrees. Chosen because angles in a URDF are below
+    one turn."""
 
 
 URDF_ANGLE = UrdfAngleSettings()
 
 
 def check_elements(robot: ElementTree.Element, path: Path) -> None:
-    """Raise an InputError if an element is misspelt, doubled or not numbers."""
+    """Raise an InputError if an element is unknown, doubled or has invalid attributes."""
     for parent in (*robot.iter("joint"), *robot.iter("link"), *robot.iter("inertial")):
         where = f"{path}: {parent.tag} '{parent.get('name', '')}'"
         counts = Counter(child.tag for child in parent if isinstance(child.tag, str))
         for tag, count in counts.items():
             if tag not in _CHILDREN[parent.tag]:
-                near = names_near(tag, sorted(_CHILDREN[parent.tag]))
-                raise InputError(f"unknown element <{tag}>", where, near)
+                hint = names_near(tag, sorted(_CHILDREN[parent.tag]))
+                raise InputError(f"unknown element <{tag}>", where, hint)
             if count > 1 and tag not in _MANY:
                 raise InputError(f"has {count} elements <{tag}>", where, "keep one")
         for child in parent:
@@ -106,7 +107,7 @@ _HEAVIEST = 1000.0
 
 
 def _check_attributes(element: ElementTree.Element, where: str) -> None:
-    """Raise if an origin, an axis or an inertia is misspelt, not numbers or too large."""
+    """Raise an InputError if an attribute is unknown, not numbers or too large."""
     attributes = _ATTRIBUTES[element.tag]
     for key, text in element.attrib.items():
         if key not in attributes:
@@ -125,7 +126,7 @@ def _check_attributes(element: ElementTree.Element, where: str) -> None:
             raise InputError(f'<{element.tag} {key}="{text}"> is too large for a body', where, hint)
         if key == "rpy" and np.abs(numbers_of(element, key)).max() > URDF_ANGLE.max_angle:
             hint = "give rpy in radians, not in degrees"
-            raise InputError(f'<origin rpy="{text}"> turns by several turns', where, hint)
+            raise InputError(f'<origin rpy="{text}"> is a rotation by several turns', where, hint)
 
 
 def _finite(text: str, count: int) -> bool:
@@ -162,7 +163,7 @@ def check_tree(robot: ElementTree.Element, path: Path) -> None:
         for end in (parent, child):
             if end not in links:
                 hint = f"add it, or {names_near(end, links)}"
-                raise InputError(f"names a link '{end}' that is not there", where, hint)
+                raise InputError(f"names a link '{end}' that does not exist", where, hint)
         if child in parents:
             raise InputError(f"link '{child}' is the child of a second joint", where, "keep one")
         parents[child] = parent
@@ -200,9 +201,9 @@ def check_chain(
 ) -> None:
     """Raise an InputError unless the joints are exactly those of docs/patient.md.
 
-    Checked are type, axis, limits, order and identity origins of the six knee joints and of the
-    three joints of the patella. Links between them have no mass. No other joint may move, except
-    the ankle.
+    The six knee joints and the three joints of the patella must have the right type, axis, limits,
+    order and origin (the identity inside a chain). Links between them must have no mass. Except the
+    ankle, no other joint may move.
 
     Args:
         robot: tree of a right leg, or of a mirrored left leg.
@@ -216,8 +217,8 @@ def check_chain(
             continue
         for name in chain_joints:
             if name not in joints:
-                near = f"add it, or rename one: {names_near(name, joints)}"
-                raise InputError(f"has no joint '{name}'", path, near)
+                hint = f"add it, or rename one: {names_near(name, joints)}"
+                raise InputError(f"has no joint '{name}'", path, hint)
         _check_axes(joints, chain_joints, path, side)
         _check_order(robot, joints, list(chain_joints), (start, end), path)
     names = [_ANKLE_JOINT, *KNEE_JOINTS, *PATELLA_JOINTS]
@@ -238,7 +239,7 @@ def _check_axes(
     path: Path,
     side: str,
 ) -> None:
-    """Raise unless each joint has the expected type and axis, and does not mimic another."""
+    """Raise an InputError unless each joint has its type and axis, and does not mimic another."""
     axes = {name: numbers_of(joints[name].find("axis"), "xyz", "1 0 0") for name in expected}
     flipped = [
         name
@@ -263,11 +264,14 @@ def _check_axes(
                 f"{mirrored}it must be {kind} about {' '.join(map(str, axis))}",
             )
         if joint.find("mimic") is not None:
-            raise InputError(f"joint '{name}' mimics another", path, "take <mimic> out")
+            raise InputError(f"joint '{name}' mimics another", path, "remove <mimic>")
 
 
 def _check_limit(joint: ElementTree.Element, path: Path) -> None:
-    """Raise unless a joint states all its limits, lower below upper. tkamb does not use them."""
+    """Raise an InputError unless a joint states all limits, lower below upper.
+
+    tkamb does not use them, but parsers of URDF need them.
+    """
     limit, name = joint.find("limit"), joint.get("name")
     if limit is None or not {"lower", "upper", "effort", "velocity"} <= set(limit.keys()):
         hint = "give lower, upper, effort and velocity"
@@ -284,7 +288,7 @@ def _check_order(
     between: tuple[str, str],
     path: Path,
 ) -> None:
-    """Raise unless the joints form a chain at one point, without mass between them."""
+    """Raise an InputError unless the joints form a chain at one point, without mass inside."""
     masses = {str(link.get("name")): link.find("inertial/mass") for link in robot.findall("link")}
     order = f"the order is {between[0]}, {', '.join(names)}, {between[1]}"
     link = between[0]
@@ -297,18 +301,18 @@ def _check_order(
         numbers = np.concatenate([numbers_of(origin, "xyz"), numbers_of(origin, "rpy")])
         if name != names[0] and numbers.any():
             words = " ".join(f"{value:g}" for value in numbers)
-            hint = f"only '{names[0]}' is placed: give it the identity"
+            hint = f"give it the identity; only '{names[0]}' has another origin"
             raise InputError(f"joint '{name}' has an origin {words} in the chain", path, hint)
         mass = masses.get(child)
         if name != names[-1] and mass is not None and numbers_of(mass, "value", "0").any():
-            hint = "links inside the chain have none: put it on tibia or femur"
+            hint = "move the mass to tibia or femur; links inside the chain have none"
             raise InputError(f"link '{child}' has a mass", path, hint)
     if link != between[1]:
         raise InputError(f"joint '{names[-1]}' leads to '{link}'", path, order)
 
 
 def check_inertia(link: ElementTree.Element, path: Path, needed: bool) -> None:
-    """Raise an InputError unless mass and inertia tensor are those of a real body.
+    """Raise an InputError unless mass and inertia are possible for a body.
 
     Args:
         link: the link.
@@ -334,7 +338,7 @@ def check_inertia(link: ElementTree.Element, path: Path, needed: bool) -> None:
     if not (kilograms > 0 and is_body):
         moments = ", ".join(f"{p:.3g}" for p in principal)
         raise InputError(
-            f"singular inertia: mass {kilograms:g} kg, principal moments {moments} kg·m²",
+            f"impossible inertia: mass {kilograms:g} kg, principal moments {moments} kg·m²",
             where,
             "a body needs mass > 0 and moments > 0, none larger than the sum of the others",
         )

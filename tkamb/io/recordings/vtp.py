@@ -1,7 +1,9 @@
 """Triangles from VTK's XML PolyData (.vtp): text, base64 or raw, in place or appended.
 
-Format: VTK User's Guide, "VTK XML file formats". The header of an array is its length in bytes. If
-the array is compressed by zlib, its header is the number and sizes of its blocks.
+The header of an array is its length in bytes. If the array is compressed by zlib, its header is the
+number and sizes of its blocks.
+
+Format: VTK User's Guide, "VTK XML file formats".
 """
 
 import base64
@@ -29,15 +31,15 @@ _TYPES = {"Float32": "f4", "Float64": "f8"} | {
     for sign, letter in (("", "i"), ("U", "u"))
     for bits in (8, 16, 32, 64)
 }
-_AGAIN = "save it again as ASCII .vtp, .stl or .ply"
+_SAVE_AGAIN = "save it again as ASCII .vtp, .stl or .ply"
 _RAW = re.compile(rb"<AppendedData[^>]*encoding=[\"']raw[\"'][^>]*>\s*_")
 
 
 def read_vtp(path: str | Path) -> tuple[Array, Indices]:
     """Return the points (n, 3) and triangles (k, 3) of a .vtp file, in file units.
 
-    Polygons of more than three corners are cut into triangles. Vertices, lines and data are not
-    read.
+    Polygons of more than three corners are cut into triangles. Vertex cells, lines and data arrays
+    are not read.
 
     Raises:
         InputError: no such file, not PolyData, cut short, triangle strips, or another encoding.
@@ -60,7 +62,7 @@ def _read(path: str | Path, select: "Callable[[_PolyData], Read]") -> Read:
         return select(_PolyData(content, path))
     except (ValueError, KeyError, OverflowError, zlib.error) as error:
         reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
-        raise InputError(f"cannot be read as VTK PolyData ({reason})", path, _AGAIN) from None
+        raise InputError(f"cannot be read as VTK PolyData ({reason})", path, _SAVE_AGAIN) from None
 
 
 class _PolyData:
@@ -82,7 +84,7 @@ class _PolyData:
         self._order = ">" if self._root.get("byte_order") == "BigEndian" else "<"
         header = self._root.get("header_type", "UInt32")
         if header not in ("UInt32", "UInt64"):
-            raise ValueError(f"header type '{header}'")
+            raise ValueError(f"unknown header type '{header}'")
         self._header = np.dtype(self._order + _TYPES[header])
         block = self._root.find("AppendedData")
         if block is not None and not self._raw:
@@ -98,7 +100,7 @@ class _PolyData:
                 continue
             corners = self._array(piece.find("Points/DataArray"), "points").reshape(-1, 3)
             if int(piece.get("NumberOfPoints", len(corners))) != len(corners):
-                raise ValueError("the number of points is not as announced")
+                raise ValueError("the number of points is not as stated")
             if int(piece.get("NumberOfPolys", 0)):
                 faces.append(self._polygons(piece, corners.astype(float)) + start)
             points.append(corners.astype(float))
@@ -119,7 +121,7 @@ class _PolyData:
         index = self._array(named["connectivity"], "connectivity").astype(np.int64)
         ends = self._array(named["offsets"], "offsets").astype(np.int64)
         if len(ends) != int(piece.get("NumberOfPolys", 0)):
-            raise ValueError("the number of polygons is not as announced")
+            raise ValueError("the number of polygons is not as stated")
         starts = np.concatenate([[0], ends[:-1]])
         if (ends < starts).any() or ends[-1] != len(index):
             raise ValueError("offsets and connectivity do not agree")
@@ -142,7 +144,7 @@ class _PolyData:
                 raise ValueError("it is cut short")
             source = self._appended[offset:]
         else:
-            raise ValueError(f"format '{form}'")
+            raise ValueError(f"unknown format '{form}'")
         raw = form == "appended" and self._raw
         return np.frombuffer(self._decode(source, raw), dtype)
 
@@ -172,7 +174,7 @@ class _PolyData:
         return b"".join(blocks)
 
     def _uncompressed(self, source: bytes, header: bytes, remaining: bytes, raw: bool) -> bytes:
-        """Return an uncompressed array. Base64 encodes its header jointly or separately."""
+        """Return the bytes of an uncompressed array; in base64 the header may be separate."""
         size, length = len(header), int(np.frombuffer(header, self._header)[0])
         coded = source[: 4 * -(-size // 3)]
         if raw or (size % 3 and coded.endswith(b"=")):
