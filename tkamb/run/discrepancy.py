@@ -341,7 +341,7 @@ def discrepancy_summary(summary: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _of_activity(errors: Sequence[TrialError], activity: str | None) -> Sequence[TrialError]:
-    """Return the trials of an activity; all trials if there are none of it."""
+    """Return the trials of an activity; all trials if the activity has none."""
     return [one for one in errors if one.activity == activity] or errors
 
 

@@ -350,7 +350,7 @@ class _Run:
         self.recorder.begin_maps(side.state.points, side.state.triangles, labels)
 
     def _take_earlier(self) -> None:
-        """Read the frames of the run to resume, the last contacts as initial guesses."""
+        """Read the frames of the run to resume. Its last contacts become initial guesses."""
         earlier, side = self.recorder.take_earlier(self.indices), self.solver.side
         if side is None or not earlier:
             return

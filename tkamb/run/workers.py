@@ -373,7 +373,7 @@ def serve() -> None:
             number, job = pickle.load(jobs)
             _send(answers, _answer(work, number, job))
     except (EOFError, ConnectionError, pickle.UnpicklingError):  # the parent has ended
-        # buffered output has no reader: a normal exit would print an error about it
+        # buffered output has no reader: a normal exit would print an error
         os._exit(0)
 
 
