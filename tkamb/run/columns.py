@@ -19,7 +19,7 @@ class Column:
         meaning: one line. Vectors are in the insert frame unless the line names another.
         needs: scene tables without which the column is empty.
         kind: type of the cells.
-        optional: True if a scene without `needs` has no such column. Otherwise it is empty.
+        optional: True if a scene without `needs` has no such column; False if the column is empty.
     """
 
     name: str

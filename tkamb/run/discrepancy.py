@@ -83,7 +83,7 @@ class DiscrepancySettings:
     shares of the load. Subject JW's measured trials og1 and og3 have 1.62 and 1.65."""
     published_total_BW: float = 0.43
     """BW: root mean square error of a published blind prediction of the total force in walking,
-    281 N (parametric model, third Grand Challenge, PMC3627216), over JW's weight."""
+    281 N (parametric model, third Grand Challenge, PMC3627216), divided by JW's weight."""
     published_medial_BW: float = 0.41
     """BW: published root mean square error of the medial force in walking, the middle of 229 to
     312 N by the four winners of the Grand Challenges (Kinney et al. 2013,
@@ -304,7 +304,7 @@ def coverage(low: Array, high: Array, measured: Array) -> tuple[int, float]:
 
 @lru_cache(maxsize=1)
 def known_errors() -> tuple[TrialError, ...]:
-    """Return the errors of all compared trials, which are part of the package."""
+    """Return the errors of all compared trials from the package's data."""
     return tuple(TrialError(**row) for row in json.loads(DATA.read_text(encoding="utf-8")))
 
 
@@ -341,7 +341,7 @@ def discrepancy_summary(summary: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _of_activity(errors: Sequence[TrialError], activity: str | None) -> Sequence[TrialError]:
-    """Return the trials of an activity; all trials if there are none of it."""
+    """Return the trials of an activity; all trials if the activity has none."""
     return [one for one in errors if one.activity == activity] or errors
 
 

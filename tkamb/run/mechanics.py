@@ -78,7 +78,7 @@ class FrameLoads:
         loads: solution of the equations.
         adjustment: femoral adjustment; None: not requested, or impossible.
         query_seconds: computing time of the closest points on the meshes, s.
-        seconds: computing time of the rest, s.
+        seconds: computing time of kinematics and equations, s.
         effect: change of the forces by the adjustment; None without an adjustment, or without a
             solution at the recorded pose.
     """
@@ -156,7 +156,7 @@ class Mechanics:
             patella=None if self.extensor is None else self.extensor.at(k),
             muscles=None if self.muscles is None else self.muscles.frame(k),
         )
-        # Joint placements round: restore the recorded coordinates, which must not change.
+        # Joint placements cause rounding errors: restore the recorded coordinates exactly.
         joints = instant.motion.joints.copy()
         joints[0, :6] = motion.coordinates[k]
         if self.extensor is not None:
@@ -178,7 +178,7 @@ class Mechanics:
         """Return the loads of frame k; NaN in a frame without a solution.
 
         Args:
-            k: frame.
+            k: index of the frame.
             adjustment: femoral adjustment; None: computed if the scene has one.
         """
         start, instant = clock.perf_counter(), self.instant(k)

@@ -76,7 +76,7 @@ class PressReport:
 
     Args:
         contact: name of the contact model.
-        resolution_mm: spacing of its map points, mm.
+        resolution_mm: spacing of the map points, mm.
         nodes: number of nodes of lattice or mesh; of map points for a model without nodes.
         load: load, N.
         result: contact result in the insert frame (mirrored for a left knee).
@@ -291,8 +291,8 @@ def press_meshes(
         load: load along the normal of the insert's bottom, N.
         units: unit of length of both files and of the pose, "mm", "cm", "m" or "inch".
         pose: pose of the femoral mesh in the axes of the insert's mesh, x, y, z (units), rx, ry, rz
-            (deg, intrinsic x-y-z). The height above the insert is not used. None: both files have
-            one origin.
+            (deg, intrinsic x-y-z). The height above the insert is not used. None: both files
+            share one origin.
         contact: name from `tkamb contact list`.
         resolution_mm: spacing of the map points, mm.
         bearing: "fixed" or "mobile".
@@ -301,7 +301,7 @@ def press_meshes(
         axes: mesh axes that point anterior, superior and right.
         side: side of the knee. A left knee is computed as its mirror image.
         adjust: whether the femoral component is adjusted before contact
-            (`tkamb.geometry.adjustment`). A condyle of the pose must be within 3 mm of the insert.
+            (`tkamb.geometry.adjustment`). At `pose`, a condyle must be within 3 mm of the insert.
         restore_when: rule of the adjustment to restore the recorded rotation after the press:
             penetration and coronal angle exceed the adjustment ("both", Sharma 2008, the default),
             or one of them does ("either").

@@ -210,7 +210,7 @@ def _knee(case: Case, shared: SharedState | None, contact: "KneeContact | None")
 
 
 def _check_near(case: Case, knee: Knee, poses: Array) -> None:
-    """Raise unless a condyle is near the insert in the first, middle or last frame."""
+    """Raise an InputError if no condyle is near the insert in the first, middle or last frame."""
     table = case.scene.contact
     if table is None or table.released:
         return
@@ -235,7 +235,7 @@ def _extensor_frames(
     """Return the patella of a case with [patella] in all frames.
 
     Raises:
-        InputError: no patella was recorded, or a cause of `ExtensorFrames`.
+        InputError: no patella was recorded, or `ExtensorFrames` raises one.
     """
     from tkamb.knee.extensor import ExtensorFrames
 

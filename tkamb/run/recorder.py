@@ -269,7 +269,7 @@ class Recorder:
         self._stack = ExitStack()
 
     def begin_maps(self, points: Array, triangles: Array, labels: Mapping[str, Any]) -> None:
-        """Prepare to record pressure maps. It is not called without contact.
+        """Prepare to record pressure maps. A run without contact does not call it.
 
         Args:
             points: map points, m, (n, 3).

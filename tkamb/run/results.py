@@ -54,8 +54,7 @@ class StatisticsSettings:
     """1: least number of samples. Chosen because the 5th percentile of 20 samples lies between the
     two smallest."""
     max_failed_share: float = 0.5
-    """1: largest share of failed samples. Chosen because the rest are not representative if more
-    fail."""
+    """1: largest share of failed samples. Chosen because a minority is not representative."""
 
 
 STATISTICS_LIMITS = StatisticsSettings()
@@ -138,7 +137,7 @@ class Results:
         return np.array(result) if len(result) == len(ends) else None
 
     def band_with_discrepancy(self, name: str) -> Array | None:
-        """Return p05 and p95 (2, f) of a column from inputs and discrepancy; None: no such band."""
+        """Return p05 and p95 (2, f) of a column with input errors and discrepancy, or None."""
         ends = [self.bands.get(f"{name}_discrepancy_{end}") for end in ("p05", "p95")]
         finite = [end for end in ends if end is not None]
         return np.array(finite) if len(finite) == len(ends) else None

@@ -105,7 +105,7 @@ def read_summary(directory: Path) -> dict[str, Any]:
 def differences(directory: Path, summary: Mapping[str, Any]) -> list[str]:
     """Return messages on files of a folder that have changed since they were written.
 
-    There are none for results of a release without SHA-256.
+    The list is empty for results of a release without SHA-256.
     """
     messages, recorded = [], summary.get("files")
     if not isinstance(recorded, Mapping):

@@ -28,7 +28,7 @@ class Setting:
 
     Args:
         name: dotted name, such as "lattice_solver.force_tolerance".
-        value: value in this process.
+        value: current value.
         default: default value.
         meaning: unit, meaning and origin.
         algorithm: first line of the docstring of the settings class.
@@ -44,7 +44,7 @@ class Setting:
 
 
 def all_settings() -> list[Setting]:
-    """Return the settings of all algorithms in the order of their modules, which are imported."""
+    """Import all modules with settings, and return the settings in the order of the modules."""
     rows: list[Setting] = []
     for path in sorted(PACKAGE.rglob("*.py")):
         text = path.read_text(encoding="utf-8")

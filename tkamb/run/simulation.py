@@ -76,9 +76,7 @@ class FrameSolver:
         self.mechanics = mechanics_of(case)
         self.plausibility = Plausibility(case, self.mechanics)
         last = max(frames or range(len(case.motion.time)))
-        if (
-            slips is None
-        ):  # slips are those of the recorded motion: none if coordinates are released
+        if slips is None:  # slips belong to the recorded motion: none if coordinates are released
             released = case.scene.contact and case.scene.contact.released
             slips = {} if released else self.mechanics.slips(last)
         self.slips = slips
@@ -203,8 +201,8 @@ def simulate(
 
     Args:
         scene: scene, path of a scene file, or case.
-        contact: name of a contact model; None: that of the scene.
-        resolution_mm: spacing of the map points, mm; None: that of the scene.
+        contact: name of a contact model; None: the scene's model.
+        resolution_mm: spacing of the map points, mm; None: the scene's spacing.
         preset: name of a published study. Its choices replace those of the scene, as with
             `tkamb run --as` (`tkamb.io.presets`), except for `contact` and `resolution_mm`.
         frames: frames to compute, a slice or a range; None: all.
@@ -352,7 +350,7 @@ class _Run:
         self.recorder.begin_maps(side.state.points, side.state.triangles, labels)
 
     def _take_earlier(self) -> None:
-        """Read the frames of the run to resume, the last contacts as initial guesses."""
+        """Read the frames of the run to resume. Its last contacts become initial guesses."""
         earlier, side = self.recorder.take_earlier(self.indices), self.solver.side
         if side is None or not earlier:
             return

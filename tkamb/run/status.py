@@ -34,10 +34,10 @@ class AgreementSettings:
     """1: share of the load below which a condyle counts as unloaded. Chosen because the errors of
     the split are larger."""
     adduction_error: float = 0.5 * DEGREE
-    """rad: error of the recorded adduction, 0.5 deg, that of fluoroscopy."""
+    """rad: error of adduction from fluoroscopy, 0.5 deg."""
     moved_load_share: float = 0.25
-    """1: share of the load. If the error of adduction shifts more of the load between the condyles,
-    the recorded pose does not determine the split. Chosen because a quarter may decide which
+    """1: largest share of the load that the error of adduction may shift between condyles. Above
+    it, the recorded pose does not determine the split. Chosen because a quarter may decide which
     condyle carries more."""
 
 
@@ -48,7 +48,7 @@ NAN = float("nan")
 
 
 def contradictions(case: "Case", body: "FrameLoads", contact: "FrameContact | None") -> list[str]:
-    """Return the contradictions in a frame, in words; none for a failed frame."""
+    """Return the contradictions in a frame, in words; empty for a failed frame."""
     if body.loads.problems:
         return []
     words = []
@@ -144,7 +144,7 @@ PATELLA_ACROSS = 0.03
 """1: largest share of the patellofemoral force across the button's normal without a flag, for a
 recorded patella. It corresponds to an error of 2 deg. A patella in equilibrium has 0.002."""
 PATELLA_LIGHT = 0.01
-"""BW: largest force across the normal without a flag."""
+"""BW: largest force across the button's normal without a flag."""
 
 FAILED = "failed: "
 
@@ -160,7 +160,7 @@ def frame_status(
 
     Args:
         case: the case.
-        k: frame.
+        k: index of the frame.
         body: loads of the frame by the equations.
         contact: contact of the frame; None: not modelled.
         question_flags: flags of the questions on the frame (`tkamb.run.plausibility`).

@@ -190,7 +190,7 @@ def _gait(case: Case) -> dict[str, Any]:
     inputs: dict[str, Any] = {}
     cycle = case.gait_cycle_s
     if cycle is None and case.motion.cycle_percent is None and case.scene.output.axis == "cycle":
-        # Without a known cycle the whole motion is one, also if only some frames are computed.
+        # Without a known cycle the whole motion is one, even if only some frames are computed.
         cycle = (float(case.motion.time[0]), float(case.motion.time[-1]))
     if cycle is not None:
         inputs["cycle_percent_s"] = list(cycle)
@@ -341,7 +341,7 @@ def assumptions(case: Case) -> list[str]:
 
 
 def _marker_reading(case: Case) -> str:
-    """Return a sentence on the method for skin markers, and its difference from the other one."""
+    """Return a sentence on the method for skin markers, and its difference from the other."""
     markers = case.motion.markers
     assert markers is not None and case.scene.motion.markers is not None
     used = {

@@ -289,7 +289,7 @@ def _check_depth(value: object, path: object) -> None:
 
 
 def _difference(value: Any, kind: Kind, where: str) -> str | None:
-    """Return a message on a value that is not of a kind; None: it is."""
+    """Return a message on a value that is not of a kind, else None."""
     if isinstance(kind, tuple):
         problems = [_difference(value, one, where) for one in kind]
         return None if None in problems else max(filter(None, problems), key=_depth_of_message)

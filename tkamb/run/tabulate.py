@@ -55,7 +55,7 @@ def frame_row(
 
     Args:
         case: the case.
-        k: frame of the motion.
+        k: index of the frame.
         body: loads of the frame by the equations.
         contact: contact of the frame; None: not modelled.
         slips: side -> slip in the frames up to k + 1, see `Mechanics.slips`.
@@ -200,8 +200,8 @@ def _slip_row(
     - Slip and slip rate, from the arcs between successive lowest points (`tkamb.knee.slip`).
     - Sliding velocity: forward rigid-body velocity of the femur's contact point relative to the
       insert, minus the part from axial rotation.
-    - Normal velocity: the same along the contact normal. It shows by how much the recorded motion
-      violates the contact constraint.
+    - Normal velocity: relative velocity of that point along the contact normal. It shows by how
+      much the recorded motion violates the contact constraint.
     """
     values = {
         "slip_mm": slip.slip[k],

@@ -21,8 +21,7 @@ class Stages:
 
     Args:
         count: number of stages.
-        stream: stream for the output; None: standard error. Nothing is printed unless the stream
-            is a terminal.
+        stream: output stream; None: standard error. Stages are printed on a terminal only.
     """
 
     def __init__(self, count: int, stream: TextIO | None = None) -> None:
@@ -53,7 +52,7 @@ class Stages:
         return self._counted("writing results and report", drawn, "plot")
 
     def end(self) -> None:
-        """End the stage and print its time."""
+        """End the current stage and print its time."""
         if self._open:
             self._write(f" {clock.perf_counter() - self._began:.1f} s\n")
         self._open = False
@@ -134,7 +133,7 @@ class Profile:
 
 
 def profile_lines(report: dict[str, Any]) -> list[str]:
-    """Return a report as lines of text."""
+    """Return a report of `Profile` as lines of text."""
     total, frames = report["seconds"]["all"], report["frames"]
     lines = ["part                       seconds   share  ms per frame"]
     for name, seconds in report["seconds"].items():

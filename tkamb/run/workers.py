@@ -2,7 +2,7 @@
 
 A worker is a Python process that runs this module. It prepares the task once, reads pickled jobs
 from its standard input, and writes pickled answers to its standard output. It ends when the input
-ends, also if the parent was killed. Unlike multiprocessing, it does not import the calling script.
+ends, even if the parent was killed. Unlike multiprocessing, it does not import the calling script.
 
 Dask is an extra (`pip install 'tkamb[cluster]'`). If a worker of a cluster dies, another one
 repeats its job. The answers do not depend on the worker, since a job is a function of its number
@@ -375,7 +375,7 @@ def serve() -> None:
             number, job = pickle.load(jobs)
             _send(answers, _answer(work, number, job))
     except (EOFError, ConnectionError, pickle.UnpicklingError):  # the parent has ended
-        # buffered output has no reader: a normal exit would print an error about it
+        # buffered output has no reader: a normal exit would print an error
         os._exit(0)
 
 

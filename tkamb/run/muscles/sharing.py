@@ -311,12 +311,12 @@ class Sharing:
     """Options of the static optimisation.
 
     Args:
-        muscles: names of the muscles; None: those of `leg_muscles`.
+        muscles: names of the muscles; None: the result of `leg_muscles`.
         coordinates: names of the balanced coordinates; None: hip, knee flexion, ankle, subtalar.
-        reserve: ρ, N·m (N for a translation), for all coordinates or by name. A reserve of this
+        reserve: r, N·m (N for a translation), for all coordinates or by name. A reserve of this
             size costs as much as one fully active muscle of weight 1. inf: no cost, 0: no reserve.
         exponent: p, at least 2.
-        weights: "volume" (optimal fibre length times strength, over the mean) or "equal".
+        weights: "volume" (optimal fibre length times strength, relative to the mean) or "equal".
         lowest: least activation.
         highest: largest activation.
         law: "isometric" (F_i is the maximal isometric force, without passive force) or "hill", see
@@ -333,7 +333,7 @@ class Sharing:
     law: Literal["isometric", "hill"] = "isometric"
 
     def reserves(self, coordinates: Sequence[str]) -> Array:
-        """Return ρ (c,) of c coordinates."""
+        """Return r (c,) of c coordinates."""
         if isinstance(self.reserve, Mapping):
             return np.array([float(self.reserve[name]) for name in coordinates])
         return np.full(len(coordinates), float(self.reserve))

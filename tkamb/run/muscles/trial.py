@@ -7,7 +7,7 @@ In each frame,
 τ are the generalised forces of the motion (inertia, gravity, external loads), and R = -dL/dq the
 moment arms of the muscle lines about the balanced coordinates c. F_i is a muscle's force at full
 activation, and P_i its passive force. The reserve r_c is the moment that the muscles lack.
-Activations a and reserves minimise, with the options of `Sharing`,
+Activations a and reserves minimise, with w, p and the reserve sizes ρ of `Sharing`,
 
     Σ_i w_i a_i^p + Σ_c (r_c / ρ_c)²,   lowest <= a_i <= highest.
 
@@ -21,9 +21,9 @@ of the wrenches w on the bones gives the moment arm,
 
     Σ_bones J_boneᵀ w_bone = -dL/dq.
 
-Two effects add to it. A wrap object that is displaced by a point inside it (docs/opensim.md) pushes
-on its bone. Path points that move within their bone (quadriceps of gait2392) do work without a
-wrench on any bone.
+Two effects add to the moment arm. A wrap object that is displaced by a point inside it
+(docs/opensim.md) pushes on its bone. Path points that move within their bone (quadriceps
+of gait2392) do work without a wrench on any bone.
 """
 
 from collections.abc import Mapping, Sequence
@@ -75,7 +75,7 @@ class Bones:
             (f, m, b, 6).
         demand: wrench that the motion of each bone requires beyond gravity and external loads, in
             ground about its origin, N·m and N, (f, b, 6); see `required_wrenches`.
-        crossings: straight parts between bones; index -1: a body of no bone.
+        crossings: straight parts between bones; index -1: a body outside the leg.
     """
 
     names: tuple[str, ...]

@@ -31,8 +31,8 @@ class GroundReactionLimitSettings:
     """1: share of the peak force above which a frame is checked. Chosen because the centre of
     pressure is a quotient of small numbers at smaller forces."""
     min_lean: float = 0.03
-    """1: least standard deviation of forward over upward force for a comparison with the leg's
-    inclination. Chosen because the signs of smaller inclinations are uncertain."""
+    """1: least standard deviation of the ratio of forward to upward force that is compared with
+    the leg's inclination. Chosen because the signs of smaller inclinations are uncertain."""
     max_outward_lean: float = 0.02
     """1: largest outward over upward force. Six recordings of standing, walking and squatting have
     0.04 to 0.07 inwards. Subject JW on stairs has 0.007 outwards."""
@@ -44,11 +44,11 @@ class GroundReactionLimitSettings:
     """m: least mean distance of the centre of pressure ahead of the ankle. Seven recordings have
     0.019 to 0.061, and -0.019 or less with the opposite sign."""
     ankle_distance: float = 0.015
-    """m: largest distance of the centre of pressure from the ankle below which another unit is
-    likely. Chosen because it is 0.04 m in standing."""
+    """m: horizontal distance from the ankle. A centre of pressure that stays within it is likely
+    in another unit. In standing it is 0.04 m away."""
     max_unloaded_stance: float = 0.15
-    """s: longest time without force on a standing foot. Chosen between 0.02 s at most in four
-    recorded walks, and 0.4 s with a missing force plate."""
+    """s: longest time without force on a standing foot. Four recorded walks have at most 0.02 s.
+    A missing force plate causes 0.4 s."""
     unloaded_force: float = 0.05
     """BW: force below which a foot is unloaded. Chosen because the noise of force plates is
     smaller."""
@@ -63,8 +63,8 @@ ANKLE_ABOVE = (0.03, 0.32)
 """m: limits of the ankle's height above the plate, from a flat bare foot to tiptoe in high heels.
 """
 WALKS, STANDS = 1.0, 0.3
-"""m/s: limits of the ankle's speed. It exceeds the first in swing (4 in walking, 1.5 in slow
-walking), and is below the second in stance, until the heel rises."""
+"""m/s: limits of the ankle's speed. The ankle exceeds WALKS in swing (4 in walking, 1.5 in slow
+walking). It is slower than STANDS in stance, until the heel rises."""
 
 
 def load_questions(case: Case) -> Iterator[Question]:
@@ -199,7 +199,7 @@ def posture_questions(case: Case) -> Iterator[Question]:
 
 
 def _well_loaded(case: Case) -> Mask:
-    """Return a mask (f,) of the frames with a well loaded foot; none without centre of pressure."""
+    """Return a mask (f,) of frames with a well loaded foot; False without centre of pressure."""
     ground, table = case.ground, case.scene.ground_reaction
     if ground is None or case.tibia is None or table is None or table.applied != "cop":
         return np.zeros(len(case.motion.time), bool)

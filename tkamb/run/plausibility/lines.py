@@ -24,8 +24,8 @@ class LineLimitSettings:
     """1: largest strain of a ligament. Ligaments of the knee tear at 0.12 to 0.20 (Kennedy et al.
     1976, Butler et al. 1986)."""
     min_strain: float = -0.4
-    """1: least maximum of a ligament's strain over the motion. Chosen because a bundle with smaller
-    strains has no effect in the motion."""
+    """1: least value of a ligament's largest strain in the motion. Chosen because a bundle with
+    smaller strains has no effect in the motion."""
     max_attachment_distance: float = 0.16
     """m: largest distance of an attachment from the origin of insert or link. Chosen because the
     superficial MCL, the farthest, ends 0.06 to 0.12 below the insert."""
@@ -57,7 +57,7 @@ TUBEROSITY = (0.01, 0.11)
 """m: limits of the distance of the patellar ligament's distal end from the insert's centre."""
 PATELLA_HEIGHT, PATELLA_ASIDE = 0.025, 0.025
 """m: least height of the quadriceps insertion above the patellar ligament's end (0.039 to 0.045 in
-three models), and largest distance of both from the sagittal plane of the patella."""
+three models), and largest distance of both ends from the sagittal plane of the patella."""
 
 
 def attachment_questions(case: Case) -> Iterator[Question]:
@@ -141,7 +141,7 @@ def torn_bundles(ligaments: "Sequence[Ligament]", tensions: Mapping[str, float])
 def strain_questions(
     ligaments: "Sequence[Ligament]", strains: Mapping[str, Array], time: Array
 ) -> Iterator[Question]:
-    """Ask about bundles that would tear, or are slack by far in all frames.
+    """Ask about bundles that would tear, or are far from taut in all frames.
 
     Args:
         ligaments: ligament bundles.
@@ -179,7 +179,7 @@ def strain_questions(
 
 
 def extensor_questions(case: Case, poses: Mapping[str, Array]) -> Iterator[Question]:
-    """Ask about the ends of quadriceps and patellar ligament, and the length of the latter.
+    """Ask about the ends of quadriceps and patellar ligament, and the patellar ligament's length.
 
     Args:
         case: the case.
@@ -228,7 +228,7 @@ def extensor_questions(case: Case, poses: Mapping[str, Array]) -> Iterator[Quest
 
 
 def _tendon(lengths: Array, declared: float) -> Iterator[Question]:
-    """Ask about unlikely lengths (f,), m, of the patellar ligament, or another declared length."""
+    """Ask about unlikely lengths (f,), m, of the patellar ligament, or a wrong length_mm."""
     if not len(lengths):
         return
     low, high = float(lengths.min()), float(lengths.max())

@@ -36,11 +36,11 @@ class MovementLimitSettings:
     min_duration: float = 0.15
     """s: least duration of a motion. No movement of a leg is shorter."""
     odd_sample_window: float = 0.2
-    """s: largest distance of an outlier from the nearest frame. With a low-pass filter of 6 Hz, the
+    """s: longest time from an outlier to the nearest frame. With a low-pass filter of 6 Hz, the
     effect of an outlier after this time is below 3 % of its largest effect."""
     min_translation: float = 0.1 * MILLIMETRE
-    """m: least translation of the femur on the insert in a bend of 20 deg. Metres that are read as
-    millimetres are below."""
+    """m: least translation of the femur on the insert in a bend of 20 deg. Metres that are
+    read as millimetres give less."""
 
 
 MOVEMENT_LIMITS = MovementLimitSettings()
@@ -224,13 +224,13 @@ class SignSettings:
     """m: standard deviation of the mean gap from which the sign of AP is checked. Fluoroscopy of
     subject DM has 0.3 mm, and 1.3 mm with the wrong sign."""
     ap_share: float = 0.5
-    """1: largest ratio of that standard deviation with inverted sign to the recorded one. It is
+    """1: largest ratio of `ap_spread`'s standard deviation with inverted to recorded sign. It is
     0.25 for subject DM with the wrong sign."""
     turn_spread: float = 0.1 * MILLIMETRE
     """m: standard deviation of the difference of the condyles' gaps from which the signs of axial
     rotation and adduction are checked. Chosen because a mesh of 1 mm facets causes 0.05 mm."""
     turn_share: float = 0.7
-    """1: largest ratio of that standard deviation with inverted sign to the recorded one. It is
+    """1: largest ratio of `turn_spread`'s standard deviation with inverted to recorded sign. It is
     0.43 to 0.62 for subject DM with a wrong sign, and at least 1.6 with right signs."""
 
 

@@ -47,10 +47,10 @@ SHANK_SHARE, THIGH_SHARE = (0.19, 0.30), (0.19, 0.31)
 """1: limits of the segments' lengths as shares of body height, 0.246 and 0.245 (Drillis & Contini
 1966) minus and plus about a quarter."""
 RADII = ((0.15, 0.45), (0.05, 0.30))
-"""1: limits of the radii of gyration across and along a segment over its length. De Leva has 0.24
-to 0.37 and 0.09 to 0.16; a foot increases those of the shank."""
+"""1: limits of the radii of gyration across and along a segment, relative to its length. De Leva
+has 0.24 to 0.37 and 0.09 to 0.16; a foot increases those of the shank."""
 CENTRE = (0.15, 0.8)
-"""1: limits of the distance from the distal joint to the centre of mass over the segment's length.
+"""1: limits of the distance from the distal joint to the centre of mass, relative to the length.
 De Leva has 0.37 to 0.64."""
 
 
