@@ -101,7 +101,7 @@ def _error_card(cohort: Cohort, outcomes: Mapping[int, Outcome]) -> Card | None:
         large = large or is_large(error, PRESSURE_AND_AREA)
     if not words:
         return None
-    detail = "; ".join(words.values()) + OTHER_ERRORS
+    detail = " ".join([*words.values(), OTHER_ERRORS])
     number = f"{len(words)} setting{'s' * (len(words) > 1)}"
     return Card("Known error of the contact model", number, detail, large)
 

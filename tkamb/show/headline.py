@@ -9,7 +9,7 @@ import numpy as np
 
 from tkamb.geometry.frames import SIDES, Array
 from tkamb.run import metrics
-from tkamb.run.known_errors import is_large, known_error_words
+from tkamb.run.known_errors import is_large, short_error_words
 from tkamb.run.status import AGREEMENT
 from tkamb.show.axis import HorizontalAxis
 
@@ -43,10 +43,10 @@ class HeadlineSettings:
 HEADLINE = HeadlineSettings()
 
 OTHER_ERRORS = (
-    "; this is the error of the contact model alone: errors of load, pose, shape and material add "
-    "to it"
+    "These are errors of the contact model alone: errors of load, pose, shape and material add to "
+    "them."
 )
-"""Text after a known error."""
+"""Sentence after the known errors."""
 PRESSURE_AND_AREA = ("peak_pressure", "mean_pressure", "area")
 
 
@@ -343,8 +343,7 @@ def _peak_pressure(results: "Results", axis: HorizontalAxis) -> Card | None:
     detail += _above_yield(results, result.side)
     error = results.summary.get("known_error")
     if error is not None:
-        detail += f"; {_model(results)} {known_error_words(error, PRESSURE_AND_AREA)}"
-        detail += OTHER_ERRORS
+        detail += f" {short_error_words(error, ('peak_pressure',))}"
     large = bool(doubt) or (error is not None and is_large(error, PRESSURE_AND_AREA))
     return Card("Peak contact pressure", f"{result.value:.1f} MPa", detail, large)
 
@@ -387,11 +386,6 @@ def _post(results: "Results", axis: HorizontalAxis) -> Card | None:
         detail += " The error of this pressure is not measured."
     value = f"{result.value / metrics.body_weight(results):.2f} BW"
     return Card("Peak force on the post", value, detail)
-
-
-def _model(results: "Results") -> str:
-    table = results.summary.get("contact") or {}
-    return f"{table.get('model', 'the contact model')} at {table.get('resolution_mm', 0.0):g} mm:"
 
 
 def _extensor(results: "Results", axis: HorizontalAxis) -> Card | None:

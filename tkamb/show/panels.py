@@ -9,7 +9,7 @@ import numpy as np
 from tkamb.geometry.frames import Array
 from tkamb.io.activities import PEAKS_BW, peaks_words
 from tkamb.run.columns import is_ligament, ligament_of
-from tkamb.run.known_errors import is_large, known_error_words
+from tkamb.run.known_errors import is_large, short_error_words
 from tkamb.run.metrics import (
     body_weight,
     lateral_axis_name,
@@ -19,7 +19,6 @@ from tkamb.run.metrics import (
     split_undetermined,
     tension_ratio,
 )
-from tkamb.show.headline import OTHER_ERRORS
 from tkamb.show.style import (
     ANTERIOR,
     BLACK,
@@ -280,8 +279,7 @@ def _with_known_error(results: "Results", panel: Panel, names: tuple[str, ...]) 
     error = results.summary.get("known_error")
     if error is None:
         return panel
-    words = known_error_words(error, names)
-    note = f"{words[0].upper()}{words[1:]}{OTHER_ERRORS}."
+    note = short_error_words(error, names)
     return replace(panel, note=note, warning=is_large(error, names))
 
 

@@ -22,7 +22,7 @@ from tkamb.run.metrics import (
 )
 from tkamb.run.status import AGREEMENT
 from tkamb.show.axis import HorizontalAxis
-from tkamb.show.headline import PRESSURE_AND_AREA
+from tkamb.show.headline import OTHER_ERRORS, PRESSURE_AND_AREA
 
 if TYPE_CHECKING:
     from tkamb.run.results import Results
@@ -119,12 +119,10 @@ def _conclude_pressure(results: "Results") -> tuple[list[str], list[str]]:
     ]
     if isinstance(error, str):
         return supported, [f"Pressures and areas as absolute values: their error is {error}."]
-    words = (
-        f"{known_error_words(error, PRESSURE_AND_AREA)}; errors of load, pose and shape add to it"
-    )
+    words = f"{known_error_words(error, PRESSURE_AND_AREA)} {OTHER_ERRORS}"
     if is_large(error, PRESSURE_AND_AREA):
-        return supported, [f"Pressures and areas as absolute values: {words}."]
-    return [f"Pressures and areas of unworn surfaces: {words}.", *supported], []
+        return supported, [f"Pressures and areas as absolute values. {words}"]
+    return [f"Pressures and areas of unworn surfaces. {words}", *supported], []
 
 
 def _conclude_certainty(results: "Results") -> tuple[list[str], list[str]]:
