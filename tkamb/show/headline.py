@@ -177,7 +177,7 @@ def _discrepancy(results: "Results") -> Card | None:
     if not results.summary.get("discrepancy") or results.summary.get("measured"):
         return None
     value = f"{results.summary['discrepancy']['rmse_BW']:.2f} BW RMS"
-    detail = "This is the error of the total force against instrumented knees."
+    detail = "This is the error of the total force; the report names the trials and other forces."
     if "muscles" not in (results.summary.get("scene_tables") or {}):
         detail += " The compared runs had all muscles. This run has no [muscles], so its error "
         detail += "may be larger."
