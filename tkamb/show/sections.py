@@ -27,7 +27,9 @@ from tkamb.show.headline import OTHER_ERRORS, PRESSURE_AND_AREA
 if TYPE_CHECKING:
     from tkamb.run.results import Results
 
-ALWAYS_NOT = "Results of another patient, trial or day: this run has one knee in one motion."
+ALWAYS_NOT = (
+    "What happens in another patient, trial or day: this run describes one knee in one motion."
+)
 
 
 def conclusions(results: "Results") -> tuple[list[str], list[str]]:
@@ -74,8 +76,8 @@ def _conclude_force(results: "Results") -> tuple[list[str], list[str]]:
         ], bad
     bad.append("The effect of hamstrings and gastrocnemius: the quadriceps is the only muscle.")
     return [
-        "A lower bound of the contact force: only the quadriceps acts, and co-contraction of other "
-        "muscles would raise the force."
+        "A lower bound of the contact force in the real knee: in the model only the quadriceps "
+        "acts, and co-contraction of other muscles would raise the force."
     ], bad
 
 
@@ -106,7 +108,8 @@ def _conclude_split(results: "Results") -> tuple[list[str], list[str]]:
     if apart.all():
         return [], bad
     how = ", by equilibrium of moments" if unknown.any() else ", as far as the knee's pose is right"
-    return [f"Which condyle carries more{' elsewhere' if apart.any() else ''}{how}."], bad
+    where = " in the other frames" if apart.any() else ""
+    return [f"The share of each condyle{where}{how}."], bad
 
 
 def _conclude_pressure(results: "Results") -> tuple[list[str], list[str]]:
