@@ -228,7 +228,8 @@ def _share(results: "Results") -> Panel:
         return panel
     note = (
         f"The share by deformation is not determined in {unknown} of {len(results)} frames: "
-        "0.5 deg of adduction moves over a quarter of the load, or one condyle carries all of it."
+        "an adduction error of 0.5 deg shifts more than a quarter of the load to the other "
+        "condyle, or one condyle carries the whole load."
     )
     return replace(panel, note=note, warning=True)
 
@@ -385,7 +386,8 @@ def _residuals(results: "Results") -> Panel:
         )
     note = (
         "Forces that equilibrium needs in addition to the modelled loads. An exact model has none. "
-        "Dashed: change of the total contact force if the residuals act 10 mm higher or lower."
+        "Dashed: change of the total contact force if the residuals act 10 mm above or below the "
+        "midpoint of the contact points."
     )
     return Panel("residuals", "Residual forces", "% of the SI contact force", lines, note)
 
@@ -426,8 +428,9 @@ def _motion(results: "Results") -> Panel:
 
 def _slip(results: "Results") -> Panel:
     note = (
-        "Slip by the arc lengths on both surfaces. Slip from axial rotation alone is left out. "
-        "Condyles of equal radius slip equally."
+        "Slip is the difference of the arc lengths that the contact travels on femur and insert. "
+        "Slip due to axial rotation is not included. Condyles of equal radius have equal "
+        "slip."
     )
     return Panel("slip", "Slip since the first frame", "mm", _both_sides(results, "slip_mm"), note)
 
@@ -451,6 +454,9 @@ def _adjustment_effect(results: "Results") -> Panel:
 
 def _condition(results: "Results") -> Panel:
     lines = (_line(results, "condition_number", "condition number", BLACK),)
-    note = "Largest factor by which an input error may grow in the solution (scaled columns)."
+    note = (
+        "A relative error of the known loads grows at most by this factor in the computed forces. "
+        "The columns of the equations are scaled to unit length."
+    )
     title = "Condition number of the equilibrium"
     return Panel("condition", title, "–", lines, note, logarithmic=True, from_zero=False)
