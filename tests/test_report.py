@@ -319,7 +319,7 @@ def test_a_large_known_error_of_pressure_or_area_is_a_warning(bend, unwritten):
         results = Results(bend.columns, summary, None)
         (card,) = [c for c in cards(results, horizontal_axis(results)) if "pressure" in c.title]
         assert card.warning is coloured
-        words = ["not measured"] if area is None else ["4 % in peak", "2 % in mean"]
+        words = ["not measured"] if area is None else ["4 % of the peak", "2 % of the mean"]
         assert all(word in card.detail for word in words)
         (areas,) = [panel for panel in panels(results) if panel.name == "areas"]
         assert areas.warning is coloured

@@ -343,7 +343,7 @@ def _peak_pressure(results: "Results", axis: HorizontalAxis) -> Card | None:
     detail += _above_yield(results, result.side)
     error = results.summary.get("known_error")
     if error is not None:
-        detail += f" {short_error_words(error, ('peak_pressure',))}"
+        detail += f" {short_error_words(error, PRESSURE_AND_AREA)}"
     large = bool(doubt) or (error is not None and is_large(error, PRESSURE_AND_AREA))
     return Card("Peak contact pressure", f"{result.value:.1f} MPa", detail, large)
 
