@@ -168,7 +168,7 @@ def _peaks(results: "Results") -> Card | None:
         more = ", and by the inputs and the discrepancy of the method" if wide else ""
         sentences.append(f"The bands are 5 to 95 % by the inputs{more}: {', '.join(bands)}.")
     else:
-        sentences.append("`tkamb uncertainty` computes their uncertainty.")
+        sentences.append("`tkamb uncertainty` computes the uncertainty of these forces.")
     return Card("Peak forces: superior–inferior total, medial, lateral", value, " ".join(sentences))
 
 
@@ -177,9 +177,12 @@ def _discrepancy(results: "Results") -> Card | None:
     if not results.summary.get("discrepancy") or results.summary.get("measured"):
         return None
     value = f"{results.summary['discrepancy']['rmse_BW']:.2f} BW RMS"
-    detail = "This is the error of the total force; the report names the trials and other forces."
+    detail = (
+        "This is the error of the total force. The report's list “What to know” names the trials "
+        "and the other forces."
+    )
     if "muscles" not in (results.summary.get("scene_tables") or {}):
-        detail += " The compared runs had all muscles. This run has no [muscles], so its error "
+        detail += " The compared runs had all muscles; the error of this run, without [muscles], "
         detail += "may be larger."
     return Card("Error of this method in measured knees", value, detail)
 
@@ -401,8 +404,8 @@ def _extensor(results: "Results", axis: HorizontalAxis) -> Card | None:
         wraps = "does not wrap the femur" if first is None else _wraps_from(results, first)
         detail += f"; the quadriceps {wraps}"
     detail += (
-        f". Over the motion, the patellar ligament carries {ligament} of this tension (PL/Q) and "
-        f"the patellofemoral force is {patella} of it (PF/Q)."
+        f". Over the motion, the patellar ligament carries {ligament} of the quadriceps tension "
+        f"(PL/Q) and the patellofemoral force is {patella} of it (PF/Q)."
     )
     slope = results.columns.get("quadriceps_per_dome_mm_N")
     if slope is not None and np.isfinite(slope[result.frame]) and result.value > 0:
