@@ -42,7 +42,7 @@ def test_a_check_lists_each_file_and_writes_only_the_picture(scene, capfd):
     assert "motion (motion.csv): 6 frames" in output
     assert "flexion 28.0 to 107.9 deg" in output
     assert "measured force (implant.csv): total 0.50 to 2.00 BW, 3 samples" in output
-    assert "question: none" in output and "not modelled: " in output
+    assert "note: no unlikely value was found" in output and "not modelled: " in output
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert sorted(scene.parent.iterdir()) == sorted([*before, picture])
     picture.unlink()

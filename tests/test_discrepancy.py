@@ -118,8 +118,8 @@ def test_the_package_has_errors_of_three_trials_of_one_subject():
 
 def test_the_sentence_names_trials_and_subjects():
     words = discrepancy_words(SUMMARY)
-    assert words.startswith("when this method was compared with measured knees, it was off by ")
-    assert words.endswith("in squat: 1 trial, 1 subject")
+    assert words.startswith("Against measured knees the RMS error of this method was ")
+    assert words.endswith("in squat: 1 trial, 1 subject.")
     assert "3 trials, 1 subject" in discrepancy_words(SUMMARY | {"activity": "lunge"})
     assert "without [muscles]" in discrepancy_words({"activity": "squat"})
 

@@ -171,8 +171,8 @@ def test_frames_of_the_table_are_at_round_steps():
 
 def test_headline_numbers_equal_the_columns(bend, gait):
     shown = {card.title: card for card in cards(bend, horizontal_axis(bend))}
-    assert shown["Peak contact force"].value == f"{bend['force_total_BW'].max():.2f} BW"
-    assert f"{bend['force_total_N'].max():.0f} N" in shown["Peak contact force"].detail
+    assert shown["Peak resultant contact force"].value == f"{bend['force_total_BW'].max():.2f} BW"
+    assert f"{bend['force_total_N'].max():.0f} N" in shown["Peak resultant contact force"].detail
     peak = max(bend[f"{side}_peak_pressure_MPa"].max() for side in ("medial", "lateral"))
     assert shown["Peak contact pressure"].value == f"{peak:.1f} MPa"
     assert shown["Medial share of the load"].value == "50–58 %"
@@ -180,7 +180,7 @@ def test_headline_numbers_equal_the_columns(bend, gait):
     shown = {card.title: card for card in cards(gait, horizontal_axis(gait))}
     assert shown["Frames computed"].value == "100 of 101"
     assert shown["Frames computed"].warning
-    assert "6 to be read with care" in shown["Frames computed"].detail
+    assert "6 are to be read with care" in shown["Frames computed"].detail
 
 
 def test_the_card_states_a_peak_pressure_at_the_edge_of_the_insert(bend):
@@ -214,7 +214,7 @@ def test_a_card_states_force_and_pressure_on_the_post(bend):
         return card.value, card.detail
 
     assert title not in {card.title for card in cards(bend, axis)}
-    assert post_card() == ("none", "cam and post are not in contact")
+    assert post_card() == ("none", "Cam and post are not in contact.")
     force[80], pressure[80] = 0.5 * metrics.body_weight(bend), 32.9
     value, detail = post_card()
     assert value == "0.50 BW" and f"{force[80]:.0f} N at " in detail and "32.9\u00a0MPa" in detail
@@ -319,7 +319,7 @@ def test_a_large_known_error_of_pressure_or_area_is_a_warning(bend, unwritten):
         results = Results(bend.columns, summary, None)
         (card,) = [c for c in cards(results, horizontal_axis(results)) if "pressure" in c.title]
         assert card.warning is coloured
-        words = ["not measured"] if area is None else ["4 % in peak", "2 % in mean"]
+        words = ["not measured"] if area is None else ["4 % of the peak", "2 % of the mean"]
         assert all(word in card.detail for word in words)
         (areas,) = [panel for panel in panels(results) if panel.name == "areas"]
         assert areas.warning is coloured
@@ -676,7 +676,7 @@ def test_the_area_above_yield_is_stated_per_condyle():
     run.columns[f"{side}_area_above_yield"] = np.full(11, 0.04)
     run.columns[f"{other}_area_above_yield"] = np.full(11, 0.31)
     detail = _peak_card(run).detail
-    assert detail.startswith(side)
+    assert detail.startswith(f"The peak is on the {side} condyle")
     assert f"4 % of the {side} area and 31 % of the {other} area is above yield" in detail
 
 

@@ -197,8 +197,9 @@ def test_known_errors_at_1_mm_cover_the_held_out_cases(contact):
 def test_a_known_error_names_its_cases_and_situations():
     error = error_json(known_error("lattice", 1.0, "polyethylene"))
     words = known_error_words(error, ("peak_pressure", "area", "approach"))
-    assert words.startswith(f"in {error['cases']} reference cases the contact model was off by ")
-    assert "up to" not in words
+    assert words.startswith(
+        f"In {error['cases']} reference cases the error of the contact model was at most "
+    )
     for place in ("in the interior", "on a flank", "at an edge"):
         assert place in words
     assert error["situations"]["edge"]["area"] > error["situations"]["interior"]["area"]

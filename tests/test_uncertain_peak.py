@@ -71,7 +71,9 @@ def uncertain(failed=0):
 @pytest.mark.parametrize("failed", [0, 13, 60])
 def test_the_headline_has_median_and_band_or_the_reason_why_not(failed):
     run = uncertain(failed)
-    card = {entry.title: entry for entry in cards(run, horizontal_axis(run))}["Peak contact force"]
+    card = {entry.title: entry for entry in cards(run, horizontal_axis(run))}[
+        "Peak resultant contact force"
+    ]
     uncertainty = SimpleNamespace(results=run, bands=run.bands, tornado=[], indices=[])
     line = headline(uncertainty)[0]
     if failed == 60:

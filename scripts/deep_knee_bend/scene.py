@@ -97,7 +97,8 @@ axis = "flexion"
 activity = "squat"  # of instrumented knees, for the report
 notes = [
   "Nobody was measured: geometry, motion and ground reaction are made to fit each other.",
-  "First and last frame stand still: without sliding there is no friction, so the residuals jump.",
+  "The knee does not move in the first and in the last frame, so that friction is zero there.",
+  "Therefore the residuals change abruptly at these two frames.",
 ]
 """
 

@@ -34,10 +34,11 @@ PEAKS_BW: dict[str, dict[str, float]] = {
 
 
 def peaks_words(activity: str) -> str:
-    """Return two sentences on the published mean peak forces of an activity."""
+    """Return sentences on the published mean peak forces of an activity."""
     parts = [f"{force:.2f} BW ({source})" for source, force in PEAKS_BW[activity].items()]
     plural = "peaks" if len(parts) > 1 else "peak"
     return (
         f"Grey: mean {plural} of instrumented knees in {activity}, {', '.join(parts)}. "
-        "Subjects differ by more than these means do; a peak near them does not validate a result."
+        "Subjects differ from each other more than these means do. A peak near a mean does not "
+        "validate a result."
     )

@@ -352,10 +352,12 @@ def rms_error(errors: Sequence[TrialError], force: str, activity: str | None) ->
 
 
 def discrepancy_words(summary: Mapping[str, Any]) -> str:
-    """Return a sentence on the errors of the method against measured knees."""
+    """Return sentences on the errors of the method against measured knees."""
     errors, activity = known_errors(), summary.get("activity")
     compared = _of_activity(errors, activity)
-    of_what = f"in {activity}" if any(one.activity == activity for one in errors) else "in all"
+    of_what = (
+        f"in {activity}" if any(one.activity == activity for one in errors) else "in all activities"
+    )
     parts = []
     for force in FORCES:
         if any(one.force == force for one in compared):
@@ -363,11 +365,12 @@ def discrepancy_words(summary: Mapping[str, Any]) -> str:
     trials = len({one.trial for one in compared})
     subjects = len({one.subject for one in compared})
     words = (
-        f"when this method was compared with measured knees, it was off by {', '.join(parts)} RMS "
-        f"{of_what}: {trials} trial{'s' * (trials != 1)}, "
-        f"{subjects} subject{'s' * (subjects != 1)}"
+        f"Against measured knees the RMS error of this method was {', '.join(parts)} {of_what}: "
+        f"{trials} trial{'s' * (trials != 1)}, {subjects} subject{'s' * (subjects != 1)}."
     )
     if "muscles" in (summary.get("scene_tables") or {}):
         return words
-    reason = "those runs had all muscles, so this run, without [muscles], may be farther off"
-    return f"{words}; {reason}"
+    reason = (
+        "The compared runs had all muscles. This run, without [muscles], may have a larger error."
+    )
+    return f"{words} {reason}"

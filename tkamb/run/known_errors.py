@@ -109,26 +109,48 @@ def as_json(error: KnownError | None) -> dict[str, Any] | str:
 
 
 def known_error_words(error: Mapping[str, Any] | str, names: Iterable[str]) -> str:
-    """Return a sentence on the known errors of some quantities.
+    """Return full sentences on the known errors of some quantities.
 
     Args:
         error: value of the key `known_error` in summary.json.
         names: quantities, fields of `KnownError`.
     """
     if isinstance(error, str):
-        return f"error of this setting: {error}"
-    parts = ", ".join(f"{100 * error[name]:.2g} % in {name.replace('_', ' ')}" for name in names)
-    words = f"in {error['cases']} reference cases the contact model was off by {parts}"
-    situations = error.get("situations") or {}
+        return f"The error of this setting of the contact model is {error}."
+    names = list(names)
+    words = (
+        f"In {error['cases']} reference cases the error of the contact model was at most "
+        f"{_listed(error, names)}."
+    )
     stated = [name for name in names if name in ("peak_pressure", "area")]
     places = [
-        f"{_PLACES[place]} {' and '.join(f'{100 * errors[name]:.2g} %' for name in stated)}"
-        for place, errors in situations.items()
+        f"{_PLACES[place]} {_listed(errors, stated)}"
+        for place, errors in (error.get("situations") or {}).items()
     ]
     if stated and places:
-        quantities = " and ".join(name.replace("_", " ") for name in stated)
-        words += f" ({quantities}: {', '.join(places)})"
+        words += f" By the place of the contact it was at most: {'; '.join(places)}."
     return words
+
+
+def short_error_words(error: Mapping[str, Any] | str, names: Iterable[str]) -> str:
+    """Return one sentence on the known errors that refers to the report's conclusions.
+
+    Args:
+        error: value of the key `known_error` in summary.json.
+        names: quantities, fields of `KnownError`.
+    """
+    if isinstance(error, str):
+        return known_error_words(error, names)
+    return (
+        "In reference cases the error of the contact model alone was at most "
+        f"{_listed(error, names)}: see the report's conclusions."
+    )
+
+
+def _listed(errors: Mapping[str, Any], names: Iterable[str]) -> str:
+    """Return errors in words, for example "5 % of the peak pressure and 3 % of the area"."""
+    parts = [f"{100 * errors[name]:.2g} % of the {name.replace('_', ' ')}" for name in names]
+    return " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
 
 
 _PLACES = {"interior": "in the interior", "flank": "on a flank", "edge": "at an edge"}

@@ -38,8 +38,8 @@ from tkamb.units import DEGREE, MILLIMETRE
 RESIDUALS = (
     "Residuals are the forces along AP (anterior–posterior) and ML (medial–lateral) and the moment "
     "about the tibia's long axis that equilibrium needs beyond the modelled loads. They act at the "
-    "midpoint of the contact points. An exact model has none. residual_sensitivity_N is the "
-    "largest change of the total force if they act 10 mm higher or lower."
+    "midpoint of the contact points. An exact model has none. Results also contain the largest "
+    "change of the total force if they act 10 mm above or below this midpoint."
 )
 
 POST_HELD = (
@@ -289,12 +289,15 @@ def assumptions(case: Case) -> list[str]:
     """Return the assumptions of a run as sentences."""
     scene = case.scene
     sentences = [
-        "Segments are rigid; hip force and moment are those of all structures across the hip.",
+        "Segments are rigid. The force and the moment at the hip are sums over all structures that "
+        "cross the hip.",
     ]
     if scene.preset is not None:
         sentences += scene.preset.sentences()
     if scene.motion.cutoff_Hz == "none":
-        sentences.append("The motion is differentiated as given, unfiltered.")
+        sentences.append(
+            "The motion is not filtered before velocities and accelerations are computed from it."
+        )
     else:
         sentences.append(f"The motion is low-passed at {scene.motion.cutoff_Hz:g} Hz.")
     if case.ground is not None and case.ground.level_assumed:
@@ -376,11 +379,14 @@ def _agreement(table: ContactTable) -> str:
         names = ", ".join(sorted({*table.released, "si"}))
         return f"{names} are found by equilibrium of body and contact, not recorded."
     sentence = (
-        "The contact model is loaded with the superior-inferior force at the measured rotation; "
+        "The contact model is loaded with the superior-inferior force at the measured rotation. "
     )
     if table.coupling == "points":
-        return sentence + "its resultants act in the equations of the body."
-    return sentence + "its result does not change the forces of the body."
+        return sentence + "Its resultants act in the equations of motion."
+    return (
+        sentence
+        + "The result of the contact model does not change the forces in the equations of motion."
+    )
 
 
 def _bearing(scene: Scene) -> tuple[str, ...]:

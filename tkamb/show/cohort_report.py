@@ -101,7 +101,7 @@ def _error_card(cohort: Cohort, outcomes: Mapping[int, Outcome]) -> Card | None:
         large = large or is_large(error, PRESSURE_AND_AREA)
     if not words:
         return None
-    detail = "; ".join(words.values()) + OTHER_ERRORS
+    detail = " ".join([*words.values(), OTHER_ERRORS])
     number = f"{len(words)} setting{'s' * (len(words) > 1)}"
     return Card("Known error of the contact model", number, detail, large)
 
@@ -142,7 +142,7 @@ def _cards(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Gro
     value, detail = f"{means[low]:.2f}–{means[high]:.2f} BW", f"least {low}, most {high}"
     if f"{means[low]:.2f}" == f"{means[high]:.2f}":
         value, detail = f"{means[low]:.2f} BW", "alike in all groups"
-    result.append(Card("Peak contact force", value, f"mean of the runs' peaks: {detail}"))
+    result.append(Card("Peak resultant contact force", value, f"mean of the runs' peaks: {detail}"))
     error = _error_card(cohort, outcomes)
     result += [] if error is None else [error]
     if cohort.table.wear is not None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from tkamb.geometry.frames import SIDES, Array
 from tkamb.run import metrics
-from tkamb.run.known_errors import is_large, known_error_words
+from tkamb.run.known_errors import is_large, short_error_words
 from tkamb.run.status import AGREEMENT
 from tkamb.show.axis import HorizontalAxis
 
@@ -43,10 +43,10 @@ class HeadlineSettings:
 HEADLINE = HeadlineSettings()
 
 OTHER_ERRORS = (
-    "; this is the error of the contact model alone: errors of load, pose, shape and material add "
-    "to it"
+    "These are errors of the contact model alone: errors of load, pose, shape and material add to "
+    "them."
 )
-"""Text after a known error."""
+"""Sentence after the known errors."""
 PRESSURE_AND_AREA = ("peak_pressure", "mean_pressure", "area")
 
 
@@ -158,21 +158,33 @@ def _peaks(results: "Results") -> Card | None:
         values.append(f"{name} {number}")
         bands += [f"{name} {band.removesuffix(')').replace('; ', ' and ')}"] if band else []
     value = ", ".join(values) + " BW"
-    detail = peak_legend(peaks) + (": " + ", ".join(bands) if bands else "")
-    detail += "; each force at the frame of its own maximum"
-    detail += (
-        "; the total is the component along the insert's axis, as an instrumented tray measures it"
-    )
-    return Card("Peak total, medial and lateral force", value, detail)
+    kind = "a median of the samples" if bands else "computed with the inputs as given"
+    sentences = [
+        f"Each force is {kind}, at the frame of its own maximum.",
+        "The total is the component along the insert's axis, as an instrumented tray measures it.",
+    ]
+    if bands:
+        wide = any(one.get("discrepancy_p05") is not None for one in peaks.values())
+        more = ", and by the inputs and the discrepancy of the method" if wide else ""
+        sentences.append(f"The bands are 5 to 95 % by the inputs{more}: {', '.join(bands)}.")
+    else:
+        sentences.append("`tkamb uncertainty` computes the uncertainty of these forces.")
+    return Card("Peak forces: superior–inferior total, medial, lateral", value, " ".join(sentences))
 
 
 def _discrepancy(results: "Results") -> Card | None:
     """Return the error of the method in measured knees; None: unknown, or this knee is measured."""
-    words = (results.summary.get("discrepancy") or {}).get("words")
-    if not words or results.summary.get("measured"):
+    if not results.summary.get("discrepancy") or results.summary.get("measured"):
         return None
     value = f"{results.summary['discrepancy']['rmse_BW']:.2f} BW RMS"
-    return Card("Error of this method in measured knees", value, f"total force; {words}")
+    detail = (
+        "This is the error of the total force. The report's list “What to know” names the trials "
+        "and the other forces."
+    )
+    if "muscles" not in (results.summary.get("scene_tables") or {}):
+        detail += " The compared runs had all muscles; the error of this run, without [muscles], "
+        detail += "may be larger."
+    return Card("Error of this method in measured knees", value, detail)
 
 
 def muscle_limits(results: "Results") -> Card | None:
@@ -185,9 +197,11 @@ def muscle_limits(results: "Results") -> Card | None:
     largest = max((one["percent_of_largest_moment"] for one in hip.values()), default=0.0)
     named = sorted(saturated, key=lambda name: -saturated[name])[: HEADLINE.most_muscles]
     listed = ", ".join(f"{name} ({saturated[name]} frames)" for name in named)
-    detail = f"muscles at their largest force: {listed or 'none'}"
     if len(saturated) > len(named):
-        detail += f" and {len(saturated) - len(named)} more"
+        listed += f" and {len(saturated) - len(named)} more"
+    detail = "No muscle reaches its largest force."
+    if named:
+        detail = f"These muscles reach their largest force: {listed}."
     value = f"hip {largest:.0f} % of its largest moment" if hip else "no hip"
     return Card("Reserves, and saturated muscles", value, detail, bool(saturated))
 
@@ -203,15 +217,18 @@ def _peak_force(results: "Results", axis: HorizontalAxis) -> Card | None:
         sampled = table.get("peak_force_total_BW") or {}
         words = sampled.get("words", f"{result.value:.2f} BW with the inputs as given")
         detail = (
-            f"median of {table['samples']} samples and 5 to 95 % of them, "
-            f"{_where(results, axis, result.frame)}; {words}"
+            f"The value is the median of {table['samples']} samples, with 5 to 95 % of them, "
+            f"{_where(results, axis, result.frame)}. The run has {words}."
         )
-        return Card("Peak contact force", f"{middle:.2f} BW ({low:.2f}–{high:.2f})", detail)
+        return Card(
+            "Peak resultant contact force", f"{middle:.2f} BW ({low:.2f}–{high:.2f})", detail
+        )
     detail = (
-        f"{results['force_total_N'][result.frame]:.0f} N {_where(results, axis, result.frame)}; "
-        f"{100 * share:.1f} % of it superior–inferior"
+        f"The resultant is {results['force_total_N'][result.frame]:.0f} N "
+        f"{_where(results, axis, result.frame)}. "
+        f"Its superior–inferior component is {100 * share:.1f} % of it."
     )
-    return Card("Peak contact force", f"{result.value:.2f} BW", detail)
+    return Card("Peak resultant contact force", f"{result.value:.2f} BW", detail)
 
 
 def _band(results: "Results", axis: HorizontalAxis) -> Card | None:
@@ -221,35 +238,41 @@ def _band(results: "Results", axis: HorizontalAxis) -> Card | None:
     if not table or peak is None or band is None:
         return None
     low, middle, high = band[:, peak.frame]
-    parts = [f"5 to 95 % of {table['samples']} samples, median {middle:.2f} BW"]
+    parts = [f"The band holds 5 to 95 % of {table['samples']} samples, median {middle:.2f} BW."]
     if not np.isfinite(low):
         why = results.why_no_band(peak.frame)
-        parts = [f"no band {_where(results, axis, peak.frame)}: {why}"]
-    parts += [
+        parts = [f"There is no band {_where(results, axis, peak.frame)}: {why}."]
+    causes = [
         f"{words} varies most with {_largest(table, name)}"
         for name, words in BANDED.items()
         if _largest(table, name)
     ]
+    parts += [_sentence(" and ".join(causes))] if causes else []
     for name, inside in table.get("measured_inside", {}).items():
         if inside["frames"]:
             more = inside.get("share_with_discrepancy")
-            wide = "" if more is None else f", within the band with discrepancy in {more:.0%}"
+            wide = "" if more is None else f", and within the band with discrepancy in {more:.0%}"
             parts.append(
-                f"the measured {name} force lies within its band in {inside['share']:.0%} of "
-                f"{inside['frames']} frames{wide}"
+                f"The measured {name} force lies within its band in {inside['share']:.0%} of "
+                f"{inside['frames']} frames{wide}."
             )
     sampled = table.get("peak_force_total_BW")
     if sampled and sampled["median"] is None:
-        parts.append(sampled["words"])
+        parts.append(_sentence(sampled["words"]))
     worst, not_varied = table["largest_failed_share"], table["not_varied"]
     if worst > HEADLINE.notable_failed_share:
         why = "".join(f", most often: {text}" for text in [*table.get("causes_of_failure", ())][:1])
-        parts.append(f"in up to {worst:.0%} of the samples a frame failed{why}")
+        parts.append(f"In up to {worst:.0%} of the samples a frame failed{why}.")
     if not_varied:
         names = ", ".join(name.replace("_", " ") for name in not_varied)
-        parts.append(f"not varied, so not included in the band: {names}")
+        parts.append(f"The band does not include inputs that are not varied: {names}.")
     value = f"{low:.2f}–{high:.2f} BW" if np.isfinite(low) else "–"
-    return Card("Uncertainty of the peak", value, "; ".join(parts), bool(not_varied))
+    return Card("Uncertainty of the peak", value, " ".join(parts), bool(not_varied))
+
+
+def _sentence(words: str) -> str:
+    """Return words with a capital letter and a full stop."""
+    return f"{words[:1].upper()}{words[1:]}."
 
 
 def _largest(table: Mapping[str, Any], result: str) -> str:
@@ -285,48 +308,51 @@ def _shares(results: "Results") -> Card | None:
         return None
     unknown = int(metrics.split_undetermined(results).sum())
     first = "equilibrium" if unknown and "equilibrium" in texts else next(iter(texts))
-    details = [f"by {name} {text}" for name, text in texts.items() if name != first]
+    others = "".join(f"; {name} gives {text}" for name, text in texts.items() if name != first)
+    sentences = [f"{first.capitalize()} gives this share{others}."]
     share = metrics.medial_share(results, "deformation" if "deformation" in texts else first)
     alone = int(((share <= 0) | (share >= 1)).sum())
-    details += [f"one condyle is unloaded in {alone} frame{'s' * (alone > 1)}"] if alone else []
     apart = int((metrics.shares_apart(results) > AGREEMENT.share_difference).sum())
-    details += [f"both estimates disagree in {apart} frame{'s' * (apart > 1)}"] if apart else []
-    details += _adduction(results, unknown)
-    detail = "; ".join([f"by {first}, the remainder is lateral", *details])
-    return Card("Medial share of the load", texts[first], detail, bool(alone or apart or unknown))
+    flags = [f"one condyle is unloaded in {alone} frame{'s' * (alone > 1)}"] if alone else []
+    flags += [f"both estimates disagree in {apart} frame{'s' * (apart > 1)}"] if apart else []
+    sentences += [_sentence(" and ".join(flags))] if flags else []
+    sentences += _adduction(results, unknown)
+    warning = bool(alone or apart or unknown)
+    return Card("Medial share of the load", texts[first], " ".join(sentences), warning)
 
 
 def _adduction(results: "Results", unknown: int) -> list[str]:
-    """Return the effect of an error of the adduction on the split by deformation, in words."""
+    """Return a sentence on the effect of an error of the adduction; empty without an effect."""
     shift = metrics.moved_per_half_degree(results)
     words = []
     if unknown:
         where = "in any frame" if unknown == len(results) else f"in {unknown} frames"
-        words.append(f"the split by deformation is not determined {where}")
+        words.append(f"the share by deformation is not determined {where}")
     if np.isfinite(shift).any():
         text = _range(shift, " N")
-        words.append(f"± 0.5 deg of adduction moves {text} between two loaded condyles")
-    return [": ".join(words)] if words else []
+        words.append(
+            f"an error of 0.5 deg in adduction shifts {text} from one condyle to the other"
+        )
+    return [_sentence(": ".join(words))] if words else []
 
 
 def _peak_pressure(results: "Results", axis: HorizontalAxis) -> Card | None:
     result = metrics.peak(results, "<side>_peak_pressure_MPa")
     if result is None:
         return None
-    detail = f"{result.side}, {_where(results, axis, result.frame)}"
+    detail = f"The peak is on the {result.side} condyle {_where(results, axis, result.frame)}"
     doubt = metrics.doubt_of_peak(results, result.side, result.frame)
-    detail += f", where {doubt}" if doubt else ""
+    detail += f", where {doubt}." if doubt else "."
     detail += _above_yield(results, result.side)
     error = results.summary.get("known_error")
     if error is not None:
-        detail += f"; {_model(results)} {known_error_words(error, PRESSURE_AND_AREA)}"
-        detail += OTHER_ERRORS
+        detail += f" {short_error_words(error, PRESSURE_AND_AREA)}"
     large = bool(doubt) or (error is not None and is_large(error, PRESSURE_AND_AREA))
     return Card("Peak contact pressure", f"{result.value:.1f} MPa", detail, large)
 
 
 def _above_yield(results: "Results", first: str) -> str:
-    """Return the largest share of each condyle's area above the yield stress, in words.
+    """Return a sentence on the largest share of each condyle's area above the yield stress.
 
     Args:
         results: results of a run.
@@ -341,9 +367,9 @@ def _above_yield(results: "Results", first: str) -> str:
     if stress is None or not parts:
         return ""
     if not any(percent > 0 for percent, _ in parts):
-        return f"; never above yield ({stress:g}\u00a0MPa)"
+        return f" The pressure is never above yield ({stress:g}\u00a0MPa)."
     words = " and ".join(f"{percent:.0f} % of the {side} area" for percent, side in parts)
-    return f"; up to {words} is above yield ({stress:g}\u00a0MPa)"
+    return f" Up to {words} is above yield ({stress:g}\u00a0MPa)."
 
 
 def _post(results: "Results", axis: HorizontalAxis) -> Card | None:
@@ -352,18 +378,17 @@ def _post(results: "Results", axis: HorizontalAxis) -> Card | None:
     if result is None:
         return None
     if result.value <= 0:
-        return Card("Peak force on the post", "none", "cam and post are not in contact")
+        return Card("Peak force on the post", "none", "Cam and post are not in contact.")
     pressure = metrics.peak(results, "post_peak_pressure_MPa")
-    detail = f"{result.value:.0f} N {_where(results, axis, result.frame)}"
+    detail = (
+        f"The cam presses on the post with {result.value:.0f} N "
+        f"{_where(results, axis, result.frame)}."
+    )
     if pressure is not None:
-        detail += f"; up to {pressure.value:.1f}\u00a0MPa there, error not measured"
+        detail += f" The pressure on the post is at most {pressure.value:.1f}\u00a0MPa."
+        detail += " The error of this pressure is not measured."
     value = f"{result.value / metrics.body_weight(results):.2f} BW"
     return Card("Peak force on the post", value, detail)
-
-
-def _model(results: "Results") -> str:
-    table = results.summary.get("contact") or {}
-    return f"{table.get('model', 'the contact model')} at {table.get('resolution_mm', 0.0):g} mm:"
 
 
 def _extensor(results: "Results", axis: HorizontalAxis) -> Card | None:
@@ -373,21 +398,21 @@ def _extensor(results: "Results", axis: HorizontalAxis) -> Card | None:
     value = result.value / metrics.body_weight(results)
     ligament = _range(metrics.tension_ratio(results, "patellar_ligament_N"), "", 2)
     patella = _range(metrics.tension_ratio(results, "patellofemoral_N"), "", 2)
-    detail = f"{_where(results, axis, result.frame)}; ratios to the quadriceps: patellar ligament "
-    detail += f"(PL/Q) {ligament}, patellofemoral force (PF/Q) {patella}"
+    detail = f"The peak is {_where(results, axis, result.frame)}"
     if "first_wrapping_flexion_deg" in results.summary:
         first = results.summary["first_wrapping_flexion_deg"]
-        detail += (
-            "; the quadriceps does not wrap the femur"
-            if first is None
-            else f"; the quadriceps {_wraps_from(results, first)}"
-        )
+        wraps = "does not wrap the femur" if first is None else _wraps_from(results, first)
+        detail += f"; the quadriceps {wraps}"
+    detail += (
+        f". Over the motion, the patellar ligament carries {ligament} of the quadriceps tension "
+        f"(PL/Q) and the patellofemoral force is {patella} of it (PF/Q)."
+    )
     slope = results.columns.get("quadriceps_per_dome_mm_N")
     if slope is not None and np.isfinite(slope[result.frame]) and result.value > 0:
         percent = 100 * abs(slope[result.frame]) / result.value
         detail += (
-            f"; the tension changes by {percent:.1f} % if the button sits 1 mm higher or lower "
-            "on the patella"
+            f" The tension changes by {percent:.1f} % if the button is placed 1 mm higher or lower "
+            "on the patella than in the scene."
         )
     return Card("Peak quadriceps tension", f"{value:.2f} BW", detail)
 
@@ -402,8 +427,8 @@ def _wraps_from(results: "Results", first: float) -> str:
     flexion, wrap = results["flexion_deg"], results["quadriceps_wrap_deg"]
     last = max(flexion[(wrap == 0.0) & (flexion < first)], default=first)
     if first - last > HEADLINE.distant_frames_deg:
-        return f"begins to wrap the femur between {last:.0f}° and {first:.0f}°"
-    return f"wraps the femur from {first:.0f}°"
+        return f"begins to wrap the femur between {last:.0f}° and {first:.0f}° of flexion"
+    return f"wraps the femur from {first:.0f}° of flexion"
 
 
 def _residuals(results: "Results") -> Card | None:
@@ -414,20 +439,25 @@ def _residuals(results: "Results") -> Card | None:
     if {"ap", "ml", "axial_rotation"} <= set(released) and np.nanmax(
         share
     ) < HEADLINE.residual_percent:
-        detail = "AP, ML and axial rotation are released: equilibrium holds along these coordinates"
+        detail = (
+            "AP, ML and axial rotation are released. Equilibrium holds along these coordinates."
+        )
         return Card("Residual force", "none", detail)
     middle = f"{np.nanmedian(share):.1f} %"
-    detail = f"median over the frames, at most {np.nanmax(share):.1f} %, of the SI contact force"
+    detail = (
+        "The value is the median over the frames, relative to the superior–inferior contact force; "
+        f"the largest value is {np.nanmax(share):.1f} %."
+    )
     change = 100 * metrics.residual_effect(results)
     if np.isfinite(change).any():
         largest = np.nanmax(change)
         detail += (
-            f"; if the residual acted 10 mm higher or lower, the total would change by at most "
-            f"{largest:.1f} %"
+            " If the residual acted 10 mm above or below the midpoint of the contact points, the "
+            f"total would change by at most {largest:.1f} %."
         )
     axial = np.abs(results["residual_axial_Nm"])
     if np.isfinite(axial).any():
-        detail += f"; the residual axial moment is at most {np.nanmax(axial):.1f}\u00a0N·m"
+        detail += f" The residual axial moment is at most {np.nanmax(axial):.1f}\u00a0N·m."
     return Card(
         "Residual force",
         middle,
@@ -441,11 +471,12 @@ def _frames(results: "Results") -> Card:
     flagged = int(metrics.flagged(results).sum())
     value = f"{len(results) - failed} of {len(results)}"
     if failed or flagged:
-        words = [f"{failed} failed (no numbers)"] if failed else []
-        words += [f"{flagged} to be read with care"] if flagged else []
-        detail = "; ".join(words) + ": the report's table and the column status give the reasons"
+        words = [f"{failed} failed and have no numbers"] if failed else []
+        words += [f"{flagged} are to be read with care"] if flagged else []
+        detail = f"Of the frames, {' and '.join(words)}."
+        detail += " The report's table and the column status give the reasons."
     else:
-        detail = "none failed, none flagged"
+        detail = "No frame failed and none is flagged."
     return Card("Frames computed", value, detail, bool(failed or flagged))
 
 

@@ -366,7 +366,10 @@ def _contact(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterator[
     elif contact.get("coupling") == "points":
         yield "Contact points and loads were iterated until they converged."
     else:
-        yield "The superior–inferior load was pressed in at the recorded rotation."
+        yield (
+            "The femoral component was pressed onto the insert with the superior–inferior load, "
+            "at the recorded rotation."
+        )
     error = summary.get("known_error")
     if isinstance(error, str):
         yield "The error of this setting of the contact model was not measured."
@@ -391,7 +394,10 @@ def _mesh_words(measures: Mapping[str, Any]) -> Iterator[str]:
         for name, one in (measures.get("meshes") or {}).items()
     ]
     if meshes:
-        yield f"The surface meshes had {', '.join(meshes)}; an edge is the longest of a triangle."
+        yield (
+            f"The surface meshes had {', '.join(meshes)}. The median is over the longest edge of "
+            "each triangle."
+        )
     thickness = measures.get("insert_thickness_mm")
     if thickness:
         low, high = (f"{one:.1f}" for one in thickness)

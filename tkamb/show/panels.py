@@ -9,7 +9,7 @@ import numpy as np
 from tkamb.geometry.frames import Array
 from tkamb.io.activities import PEAKS_BW, peaks_words
 from tkamb.run.columns import is_ligament, ligament_of
-from tkamb.run.known_errors import is_large, known_error_words
+from tkamb.run.known_errors import is_large, short_error_words
 from tkamb.run.metrics import (
     body_weight,
     lateral_axis_name,
@@ -19,7 +19,6 @@ from tkamb.run.metrics import (
     split_undetermined,
     tension_ratio,
 )
-from tkamb.show.headline import OTHER_ERRORS
 from tkamb.show.style import (
     ANTERIOR,
     BLACK,
@@ -229,7 +228,8 @@ def _share(results: "Results") -> Panel:
         return panel
     note = (
         f"The share by deformation is not determined in {unknown} of {len(results)} frames: "
-        "0.5 deg of adduction moves over a quarter of the load, or one condyle carries all of it."
+        "an adduction error of 0.5 deg shifts more than a quarter of the load to the other "
+        "condyle, or one condyle carries the whole load."
     )
     return replace(panel, note=note, warning=True)
 
@@ -280,8 +280,7 @@ def _with_known_error(results: "Results", panel: Panel, names: tuple[str, ...]) 
     error = results.summary.get("known_error")
     if error is None:
         return panel
-    words = known_error_words(error, names)
-    note = f"{words[0].upper()}{words[1:]}{OTHER_ERRORS}."
+    note = short_error_words(error, names)
     return replace(panel, note=note, warning=is_large(error, names))
 
 
@@ -387,7 +386,8 @@ def _residuals(results: "Results") -> Panel:
         )
     note = (
         "Forces that equilibrium needs in addition to the modelled loads. An exact model has none. "
-        "Dashed: change of the total contact force if the residuals act 10 mm higher or lower."
+        "Dashed: change of the total contact force if the residuals act 10 mm above or below the "
+        "midpoint of the contact points."
     )
     return Panel("residuals", "Residual forces", "% of the SI contact force", lines, note)
 
@@ -428,8 +428,9 @@ def _motion(results: "Results") -> Panel:
 
 def _slip(results: "Results") -> Panel:
     note = (
-        "Slip by the arc lengths on both surfaces. Slip from axial rotation alone is left out. "
-        "Condyles of equal radius slip equally."
+        "Slip is the difference of the arc lengths that the contact travels on femur and insert. "
+        "Slip due to axial rotation is not included. Condyles of equal radius have equal "
+        "slip."
     )
     return Panel("slip", "Slip since the first frame", "mm", _both_sides(results, "slip_mm"), note)
 
@@ -453,6 +454,9 @@ def _adjustment_effect(results: "Results") -> Panel:
 
 def _condition(results: "Results") -> Panel:
     lines = (_line(results, "condition_number", "condition number", BLACK),)
-    note = "Largest factor by which an input error may grow in the solution (scaled columns)."
+    note = (
+        "A relative error of the known loads grows at most by this factor in the computed forces. "
+        "The columns of the equations are scaled to unit length."
+    )
     title = "Condition number of the equilibrium"
     return Panel("condition", title, "–", lines, note, logarithmic=True, from_zero=False)

@@ -42,8 +42,8 @@ SCRIPTS = ("cursor.js", "units.js", "insert.js", "downloads.js", "start.js")
 COLOURS = (
     "Lines run in time order. In every plot blue is medial, red is lateral and black is the total. "
     "Violet is superior–inferior, teal is anterior–posterior and olive is medial–lateral. A moment "
-    "or rotation has the colour of its axis. A colour of ligaments or muscles has a meaning in one "
-    "plot only."
+    "or rotation has the colour of its axis. The colour of a ligament or muscle applies within "
+    "one plot only."
 )
 PROVENANCE = (
     "scene", "scene_sha256", "started", "command", "versions", "seconds", "contact", "frame",
@@ -200,11 +200,14 @@ def _legend(results: "Results", axis: HorizontalAxis) -> list[str]:
 
 
 def _sentences(summary: dict[str, Any]) -> list[str]:
-    """Return residuals, notes, assumptions and parts not modelled as sentences, each once."""
+    """Return residuals, notes, assumptions, discrepancy and parts not modelled, each once."""
     result: list[str] = []
     for key in ("residuals", "notes", "assumptions"):
         value = summary.get(key) or []
         result.extend([value] if isinstance(value, str) else [str(item) for item in value])
+    words = (summary.get("discrepancy") or {}).get("words")
+    if words and not summary.get("measured"):
+        result.append(str(words))
     missing = summary.get("not_modelled")
     if missing:
         result.append("Not modelled: " + ", ".join(map(str, missing)) + ".")

@@ -275,14 +275,14 @@ class SceneCheck:
 
     def lines(self) -> list[str]:
         """Return the check as lines of text."""
-        nothing = ["none: nothing unlikely was found, which does not prove that all is right"]
+        nothing = ["note: no unlikely value was found, which does not prove that all are right"]
         return [
             *(f"missing: {sentence}" for sentence in self.missing),
             f"{self.scene}: can be run{' when that is installed' if self.missing else ''}",
             *(entry.line() for entry in self.entries),
             f"not modelled: {', '.join(self.not_modelled)}",
             *(f"assumed: {sentence}" for sentence in self.assumptions),
-            *(f"question: {question}" for question in self.questions or nothing),
+            *([f"question: {question}" for question in self.questions] or nothing),
             *self.answered,
         ]
 

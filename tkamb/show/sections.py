@@ -22,12 +22,14 @@ from tkamb.run.metrics import (
 )
 from tkamb.run.status import AGREEMENT
 from tkamb.show.axis import HorizontalAxis
-from tkamb.show.headline import PRESSURE_AND_AREA
+from tkamb.show.headline import OTHER_ERRORS, PRESSURE_AND_AREA
 
 if TYPE_CHECKING:
     from tkamb.run.results import Results
 
-ALWAYS_NOT = "Results of another patient, trial or day: this run has one knee in one motion."
+ALWAYS_NOT = (
+    "What happens in another patient, trial or day: this run describes one knee in one motion."
+)
 
 
 def conclusions(results: "Results") -> tuple[list[str], list[str]]:
@@ -74,8 +76,8 @@ def _conclude_force(results: "Results") -> tuple[list[str], list[str]]:
         ], bad
     bad.append("The effect of hamstrings and gastrocnemius: the quadriceps is the only muscle.")
     return [
-        "A lower bound of the contact force: only the quadriceps acts, and co-contraction of other "
-        "muscles would raise the force."
+        "A lower bound of the contact force in the real knee: in the model only the quadriceps "
+        "acts, and co-contraction of other muscles would raise the force."
     ], bad
 
 
@@ -106,7 +108,8 @@ def _conclude_split(results: "Results") -> tuple[list[str], list[str]]:
     if apart.all():
         return [], bad
     how = ", by equilibrium of moments" if unknown.any() else ", as far as the knee's pose is right"
-    return [f"Which condyle carries more{' elsewhere' if apart.any() else ''}{how}."], bad
+    where = " in the other frames" if apart.any() else ""
+    return [f"The share of each condyle{where}{how}."], bad
 
 
 def _conclude_pressure(results: "Results") -> tuple[list[str], list[str]]:
@@ -119,12 +122,10 @@ def _conclude_pressure(results: "Results") -> tuple[list[str], list[str]]:
     ]
     if isinstance(error, str):
         return supported, [f"Pressures and areas as absolute values: their error is {error}."]
-    words = (
-        f"{known_error_words(error, PRESSURE_AND_AREA)}; errors of load, pose and shape add to it"
-    )
+    words = f"{known_error_words(error, PRESSURE_AND_AREA)} {OTHER_ERRORS}"
     if is_large(error, PRESSURE_AND_AREA):
-        return supported, [f"Pressures and areas as absolute values: {words}."]
-    return [f"Pressures and areas of unworn surfaces: {words}.", *supported], []
+        return supported, [f"Pressures and areas as absolute values. {words}"]
+    return [f"Pressures and areas of unworn surfaces. {words}", *supported], []
 
 
 def _conclude_certainty(results: "Results") -> tuple[list[str], list[str]]:
