@@ -199,8 +199,8 @@ def with_block(text: str, lines: Sequence[str], name: str = "tradeoff") -> str:
 def moved(first: Sequence[tuple[float, float]], second: Sequence[tuple[float, float]]) -> list[int]:
     """Return the points that moved onto or off the front without a tie.
 
-    A point on the front that another point almost dominates is a tie: both lie within the noise of
-    each other in one of the two measurements.
+    A move is a tie if each point that beats the moved point, where that is off the front, has an
+    equal time (within `TIMING.equal_ratio`) in one of the two measurements.
 
     Args:
         first: (seconds, error) of each point.

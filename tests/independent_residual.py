@@ -68,7 +68,7 @@ def recorded_solutions():
 def difference(state, solution, result):
     """Return the larger of the errors of the reported force and gap residuals.
 
-    The errors are scaled from the norm of the nodal forces to the load.
+    Both are relative to the norm of the nodal forces, and are converted to be relative to the load.
     """
     expected, size = recomputed(state, solution, result.pose), np.linalg.norm(result.nodal_force)
     measured = solution.residual.force, solution.residual.gap

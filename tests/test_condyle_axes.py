@@ -157,7 +157,8 @@ def flags_of(femoral, insert, load=500.0):
 
 
 def test_one_condyle_on_two_separate_patches_is_flagged():
-    """A flat bar with one valley lies on two ridges 24 mm apart."""
+    """A flat bar, which counts as one condyle, lies on two ridges 24 mm apart."""
+
     ridges = dished_insert(
         lambda x, z: 8 * MM - np.minimum((np.abs(x) - 12 * MM) ** 2 / 40e-3, 3 * MM),
         20 * MM,

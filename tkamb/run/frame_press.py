@@ -228,7 +228,7 @@ def _notes(
         f"assumes {model.assumes}."
     )
     if results.summary.get("side") == "left":
-        yield "A left knee, computed as its mirror image, a right one, as in the run's files."
+        yield "A left knee: this deck and the run's files show its mirror image, a right knee."
     if "post_force_N" in results.columns:
         force, peak = (results[name][frame] for name in ("post_force_N", "post_peak_pressure_MPa"))
         yield (

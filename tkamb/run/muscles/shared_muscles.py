@@ -34,8 +34,8 @@ class SharedMuscleSettings:
     """m: largest distance of insert and hip between URDF and muscle model. Chosen because the
     rounding of the two files is smaller."""
     max_iterations: int = 8
-    """1: iterations between muscle forces and lifted condyles, after which a frame fails. Chosen
-    because frames that converge need fewer."""
+    """1: largest number of iterations, each with muscle forces for the condyles lifted so far. A
+    frame that needs more fails. Chosen because frames that converge need fewer."""
 
 
 SHARED_MUSCLES = SharedMuscleSettings()
@@ -70,9 +70,10 @@ class SharedMuscles:
 
         Args:
             strength: factors of the muscles' strength, (m,).
-            shank: shifts of the points where lines leave the shank, tibia link of a right leg, m,
-                (m, 3).
-            thigh: shifts of the points where lines reach the thigh, femur link, m, (m, 3).
+            shank: shifts of the points where lines leave the shank, m, (m, 3), in the axes of the
+                tibia link of a right leg.
+            thigh: shifts of the points where lines reach the thigh, m, (m, 3), in the axes of the
+                femur link of a right leg.
         """
         flip = MIRROR if self._left else np.eye(3)
         trial = self.trial.changed(strength, shank @ flip, thigh @ flip)
@@ -114,7 +115,7 @@ class FrameMuscles:
     def share_of_yielding_knee(
         self, geometry: KneeGeometry, base: float, per_wrench: Array
     ) -> MuscleShare:
-        """Return the force of each muscle, with released coordinates that depend on the forces.
+        """Return the force of each muscle if the knee's released coordinates depend on the forces.
 
         Args:
             geometry: geometry of the knee. Its contact is not used.
