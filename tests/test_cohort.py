@@ -388,8 +388,8 @@ def test_the_page_shows_designs_and_the_known_error_of_the_contact_model(two_by_
     page = cohort_html(two_by_two, outcomes, groups_of(two_by_two, outcomes))
     page = page.replace("\xa0", " ")
     assert "Designs side by side" in page
-    assert "foundation at 2 mm, polyethylene: in" in page
-    assert "error of the contact model alone" in page
+    assert "foundation at 2 mm, polyethylene: In" in page
+    assert "errors of the contact model alone" in page
 
 
 def test_gait_is_binned_by_cycle_without_frames_outside_the_cycle(file):
