@@ -138,6 +138,9 @@ def test_a_motion_in_the_models_coordinates_is_read_through_its_kinematics(tmp_p
     write_storage(tmp_path / "leg.mot", {"time": np.arange(60) / 60.0} | columns, in_degrees=False)
     arguments = ["import", str(osim), "--motion", str(tmp_path / "leg.mot"), "--side", "right"]
     assert main([*arguments, "--mass-kg", "53.5", "--out", str(tmp_path / "out")]) == 0
+    notes = load_scene(tmp_path / "out" / "scene.toml").output.notes
+    assert any("joint angles" in note for note in notes)
+    assert not any("skin markers" in note for note in notes)
     table = read_table(tmp_path / "out" / "motion.csv")
     np.testing.assert_allclose(
         np.radians(table.columns["flexion_deg"]), np.linspace(0.1, 1.2, 60), atol=1e-8

@@ -74,8 +74,8 @@ def add_wear(commands: Any) -> None:
         type=int,
         default=FRAMES,
         metavar="N",
-        help="largest number of frames of a recording, with the last one, or least number of rows "
-        "of a simulator; default 40",
+        help="of a recording: largest number of frames, first and last included; of a simulator's "
+        "profile: smallest number of rows; default 40",
     )
     wear.add_argument(
         "--period",

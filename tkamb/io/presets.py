@@ -216,7 +216,8 @@ class Sharma2008(Preset):
             # 4.5.2, 5.2: Halloran's curve by the fit that the source gives (E, alpha, sigma0, n).
             "contact.material": "polyethylene",
             "contact.friction": 0.05,
-            # 4.3: 0.5 mm, 0.5 deg; undone if both penetration and angle exceed these values.
+            # 4.3: at most 0.5 mm, 0.5 deg; the rotation is undone if penetration and angle after
+            # the press both exceed the adjustment.
             "contact.adjust": True,
             "contact.adjust_restore_when": "both",
             # 4.4, 4.5.5: the total force of the bodies loads the lattice; the contact does not

@@ -248,8 +248,8 @@ def _check(
     deeper = penetration - abs(adjustment.translation)
     angle_excess = (abs(angle) - abs(adjustment.coronal_angle)) * distance
     margin = settings.input_change
-    # The margin matters only if the two angles are close to each other. If both are then below the
-    # resolution of a mesh, restoring the rotation changes nothing.
+    # The margin decides only if the two angles are nearly equal. If both are below the resolution
+    # of a mesh, it makes no difference whether the rotation is restored.
     tilted = abs(angle) * distance > settings.level_difference
     outcomes = {
         _restored(settings.restore_when, *exceeded)

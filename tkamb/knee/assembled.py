@@ -197,7 +197,8 @@ class AssembledKnee:
             data: from `create_data`.
 
         Returns:
-            The poses, and whether they include the patella. It is missing if its search failed.
+            The poses, and whether they include the patella. It is missing if its search failed or
+            if the knee has no extensor mechanism.
         """
         kinematics, patella = replace(self._kinematics(data, q), pose=femur), None
         if self.extensor is not None:

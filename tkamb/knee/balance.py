@@ -9,8 +9,8 @@ the step (trapezoidal rule), and W_K is the work that K predicts:
 
 If the forces have a potential, W is the energy that a step releases. A trial that overshoots into a
 stiff contact has W < 0 and is rejected. Follower loads make K unsymmetric. An equilibrium may then
-be stable although K is not positive definite, and work does not show progress. In this case the
-search takes Newton steps, and |r| decides whether a step is accepted. A search that does not
+be stable although K is not positive definite. Near it, work does not show whether a step comes
+closer. There the search takes Newton steps, and |r| decides on acceptance. A search that does not
 converge is repeated once. In the second search |r| decides for full Newton steps, and work for
 shorter steps.
 

@@ -18,8 +18,9 @@ With fixed contact points and lines the equations are linear in all loads. This 
    The row includes contact, ligaments, patella and friction. -1/h is the moment arm of the extensor
    group, and -Q_0/h is the moment that all muscles together supply. If coordinates are released,
    contact points and the medial-lateral split depend on the muscles. The row then comes from the
-   tension of the patellar ligament, which the tangent of contact and ligaments makes linear in the
-   muscle forces (`ReleasedForces.tension_per_wrench`, `yielding_flexion_row`).
+   tension of the patellar ligament. The tangent of contact and ligaments gives this tension as a
+   linear function of the muscle forces (`ReleasedForces.tension_per_wrench`,
+   `yielding_flexion_row`).
 
 2. A normal force is the sum of the contributions of all loads (`condyle_contributions`),
 
@@ -259,7 +260,7 @@ def _tension_by_ligament(geometry: KneeGeometry) -> tuple[float, float]:
 
 
 def _solved_for_reserve(constant: float, gains: Array, slope: float) -> FlexionRow:
-    """Return the row from Q = alone + gains F + slope r, solved for the reserve r."""
+    """Return the row from Q = constant + gains F + slope r, solved for the reserve r."""
     return FlexionRow(-constant / slope, -1.0 / slope, np.asarray(gains / slope))
 
 

@@ -115,8 +115,8 @@ def implicit_step(
             by_v = cache.ddq_dv - cache.Minv @ (
                 jacobian.T @ damping @ jacobian + np.diag(viscosity)
             )
-            # Derivative of the residual by the end velocity v'. The derivative by v' is theta for
-            # the middle velocity, and theta * theta * step for the middle configuration.
+            # Derivative of the residual by the end velocity v'. The middle velocity has the
+            # derivative theta by v', the middle configuration theta * theta * step.
             residual_jacobian = np.eye(model.nv) - step * theta * (by_v + theta * step * by_q)
         last_norm = residual_norm
         change = -np.linalg.solve(residual_jacobian, residual)

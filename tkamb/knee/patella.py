@@ -35,7 +35,7 @@ class PatellaStatus(Enum):
     SEVERAL = "several_solutions"
     EDGE = "contact_on_edge_of_femoral_mesh"
     NO_CONTACT = "no contact: the button does not meet the femoral component at any rotation"
-    LINE = "a line's end lies inside what it wraps, or runs along the contact normal"
+    LINE = "an end of a line lies inside what it wraps, or the ligament is along the contact normal"
     GAP = "the gap to the femoral component does not close"
     LIGAMENT = "the given length of the patellar ligament cannot be reached"
     MOMENT = "the moments do not balance at any rotation that was tried"

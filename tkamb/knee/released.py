@@ -54,7 +54,7 @@ class ReleasedKneeSettings:
     residual_tolerance: float = 0.5
     """N (moments are divided by the lever arm): largest residual force on a released coordinate,
     with patella, lines and contact of the returned pose. A frame has no result if the residual
-    exceeds three limits: this tolerance, `residual_share` of the contact force, and the error of
+    exceeds the largest of this tolerance, `residual_share` of the contact force, and the error of
     the contact force. Chosen because measured residuals are below 0.1 N."""
     residual_share: float = 1e-3
     """1: see `residual_tolerance`. Chosen because the facets of the patella change the force by a
@@ -65,8 +65,8 @@ class ReleasedKneeSettings:
     max_passes: int = 24
     """Maximum number of passes. Chosen because a pass halves the change of a compliant knee."""
     inner_tolerance_share: float = 0.1
-    """1: remaining step of a pass with muscles, as a share of the knee's movement in this pass, at
-    which the pass ends. Chosen because more passes follow in any case."""
+    """1: a pass with muscles ends when its remaining Newton step is less than this share of the
+    knee's movement in the pass. Chosen because more passes follow in any case."""
     muscle_force_range: float = 3e-3
     """m: distance from the initial guess at which a pass ends if the last frame gave the muscle
     forces. Chosen because the knee moves by less from frame to frame."""

@@ -108,7 +108,7 @@ class JointEquilibrium:
         return reactions, wrench + columns @ reactions
 
     def forces_on_all_coordinates(self, coordinates: Array, contact: Array) -> Array:
-        """Return the generalised forces (m, 6) on all coordinates, with the y of the last row.
+        """Return the generalised forces (m, 6) on all coordinates, with y at the last of m poses.
 
         Args:
             coordinates: knee coordinates, shape (m, 6).

@@ -9,9 +9,9 @@ external loads on the leg.
 
 Lines pull and contacts push: the two normal forces, the muscle's tension, the patellar ligament's
 tension and the patellofemoral normal force are >= 0. A load that would have the wrong sign is zero,
-and a residual moment replaces it as unknown. There are at most six load states: no condyle, the
-medial or the lateral condyle lifted, each with the extensor mechanism taut or slack. The recorded
-gap may exclude some of these states.
+and a residual moment replaces it as unknown. There are at most six load states: both condyles
+loaded, the medial one lifted, or the lateral one lifted, each with the extensor mechanism taut or
+slack. The recorded gap may exclude some of these states.
 
 Reference: Komistek et al., J Biomech 38:215 (2005), doi:10.1016/j.jbiomech.2004.02.041.
 """

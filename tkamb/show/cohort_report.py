@@ -159,7 +159,8 @@ def _wear_card(outcomes: Mapping[int, Outcome], groups: Sequence[Group]) -> Card
     text = (
         f"mean of the runs by group; {len(outcomes) - lost} of {len(outcomes)} runs. By archard "
         "and cross-shear the contact area cancels: the volume hardly follows the design's "
-        "conformity. A difference that only one law shows is that law's: see the table of wear"
+        "conformity. If designs differ by one law only, the law causes the difference: see the "
+        "table of wear"
     )
     if lost:
         text += f". {lost} runs have none, see wear_failed in runs.csv"

@@ -31,8 +31,8 @@ class FrameMapSettings:
     """The pressure maps behind the report's frame slider."""
 
     rim_byte: int = 64
-    """Byte at the edge of contact; larger bytes are pressure. Chosen because smaller bytes then
-    place the edge between grid points."""
+    """Byte at the edge of contact; larger bytes are pressure. Chosen because it leaves bytes for
+    the gaps outside contact, from which the page finds the edge between grid points."""
     most_frames: int = 250
     """Largest number of maps in the page. A longer run shows the map of the nearest frame at each
     position of the slider. Chosen because it limits the size of the page."""

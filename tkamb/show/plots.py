@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 WIDTH, HEIGHT = 5.4, 3.1
 DEFAULT = ("forces", "condyles", "ratios", "pressures")
 TITLE_PAD, LEGEND_ROW = 8.0, 14.0
-"""Points: distance of a plot from its title, without a legend and per row of the legend."""
+"""Points: distance of a plot from its title if there is no legend; addition to this distance for
+each row of the legend."""
 FOOT, OVERHANG, AXIS_LABEL = 31.5, 13.0, 13.0
 """Points: height of the labels under a plot; half the width of the last tick label; width of the
 label of the vertical axis."""

@@ -364,8 +364,9 @@ def _wear_content(wear: dict[str, Any], picture: str) -> dict[str, Any]:
 def wear_of_run(results: "Results") -> dict[str, Any] | None:
     """Return the content of wear.json in a run's folder; None: the folder has no such file.
 
-    The result is empty if wear.json belongs to another scene, other files or other frames. Wear of
-    the whole motion, or of a simulator cycle, belongs to a run of any frames.
+    The result is empty if wear.json belongs to another scene, other files or other frames. If the
+    wear was computed from the whole motion or from a simulator's cycle, the frames of the run are
+    not compared.
 
     Raises:
         InputError: wear.json cannot be read.

@@ -24,8 +24,8 @@ class TradeoffPictureSettings:
     unlabelled_mm: float = 2.0
     """mm: cell size that is not written beside its point. Chosen because most points have it."""
     short_axis_ratio: float = 30.0
-    """1: a logarithmic axis has labels within its decades up to this ratio of its ends. Chosen
-    because on longer axes the labels of the decades are enough."""
+    """1: a logarithmic axis also has labels within its decades if the ratio of its two ends is
+    smaller than this. Chosen because on longer axes the labels of the decades are enough."""
     min_bodies: int = 3
     """Smallest number of different pairs of bodies that gives a recommendation. Chosen because
     the two pairs of the quick study suit `hertz`, whose errors on a knee are larger."""

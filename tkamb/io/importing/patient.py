@@ -441,6 +441,8 @@ def _notes(
 
 
 def _motion_notes(request: ImportRequest, trial: Trial) -> list[str]:
+    if trial.motion is not None:
+        return ["Shank and flexion come from the joint angles of a motion file of the model."]
     if request.poses is None or trial.shank is None:
         return [
             "Shank and flexion come from skin markers; the columns marker_rms_*, flexion_* and "

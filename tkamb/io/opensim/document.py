@@ -215,7 +215,7 @@ def _number_words(text: str, count: int | None) -> list[str]:
     """Split a list of numbers into words.
 
     Like OpenSim's reader, this function also splits `(0 1 0)`, `~[0,1,0]` and `0, 1, 0`. Commas
-    separate numbers only if `count` agrees. Otherwise they may be decimal commas.
+    separate numbers only if they give `count` numbers. Otherwise they may be decimal commas.
     """
     if count is None or count < 2:
         return text.split()
@@ -260,7 +260,8 @@ def open_document(path: Path) -> tuple[Element, list[str]]:
 
 
 def _read(path: Path, notices: list[str]) -> Element:
-    """Return the root element of one file. Errors that OpenSim accepts are repaired first."""
+    """Return the root element of one file. If it is not strict XML, it is repaired first."""
+
     content = read_bytes(path, what=WHAT)
     try:
         return parse_xml(content, path, what=WHAT)

@@ -37,8 +37,8 @@ class PlaneStringSettings:
     """Number of Runge-Kutta steps along a geodesic. Chosen because few steps suffice: the method
     (DOP853) has order eight."""
     rival_share: float = 0.1
-    """A second plane string is also tried if it is longer than the shortest by less than this
-    share of its arc. Chosen because it may lead to the shortest geodesic."""
+    """A second string in a plane is also tried if its excess over the shortest is less than this
+    share of its own arc. Chosen because it may lead to the shortest geodesic."""
     planes: int = 24
     """Number of half planes through both points that are tried. Chosen as one every 15 deg."""
 
@@ -62,7 +62,7 @@ contains the Gauss points of each Runge-Kutta step."""
 def planar_starts(
     p: Array, q: Array, axes: Array, half: Array | None
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return the shortest plane strings and the second shortest that are local minima.
+    """Return, for each p and q, the shortest string in a plane and the next local minimum.
 
     Args:
         p: starts of the strings, with the ellipsoid scaled to the unit sphere, shape (f, 3).
@@ -200,8 +200,8 @@ class GeodesicSettings:
     """rad: the iteration has converged if the error of the string's direction at its end is
     smaller. Chosen because the touching points then do not change noticeably."""
     overshoot_below: float = 0.05
-    """rad: a string that has passed its end point is shortened if its direction error is smaller
-    than this. Chosen because the derivative may have the wrong sign at larger errors."""
+    """rad: a geodesic that ends beyond its touching point is shortened if its direction error is
+    smaller than this. Chosen because the derivative may have the wrong sign at larger errors."""
 
 
 GEODESIC = GeodesicSettings()

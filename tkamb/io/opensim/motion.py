@@ -133,8 +133,6 @@ class AngleUnitSettings:
     min_rotation_deg: float = 0.2
     """deg: a joint that rotates by less in a whole recording is considered fixed. Chosen because
     the noise of a recording is about as large."""
-    max_angle: float = 2.0 * np.pi
-    """rad: no joint of a leg rotates further. Chosen as a whole turn."""
 
 
 ANGLE_UNIT = AngleUnitSettings()

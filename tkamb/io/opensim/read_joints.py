@@ -329,8 +329,8 @@ def _is_angle_of(axis: JointAxis, coordinate: str) -> bool:
 def outwards(document: Document, joints: list[Joint], bodies: Iterable[str]) -> tuple[Joint, ...]:
     """Return the joints in order from ground outwards, with `backwards` set.
 
-    A partial reading leaves out a joint that closes a loop. It welds a body without a chain of
-    joints to ground, and marks the weld as unread.
+    A partial reading leaves out a joint that closes a loop. If no chain of joints connects a body
+    with ground, it welds the body to ground and marks the weld as unread.
 
     Raises:
         InputError: the joints form a loop, or a body has no chain of joints to ground.

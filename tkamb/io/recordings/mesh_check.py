@@ -90,7 +90,7 @@ class MeshHealth:
         repairs: the repairs that loading would make.
         holes: loops of open edges in the file, widest first.
         remaining_holes: holes that loading would not close.
-        forks: number of vertices at which three or more sheets meet in an edge.
+        forks: number of vertices on edges at which three or more sheets meet.
         one_sided: whether no winding of the triangles is consistent.
         units: plausible units: those in which the mesh has the size of a part of a knee.
         flats: the largest flat sides. The first is probably the bottom of an insert.

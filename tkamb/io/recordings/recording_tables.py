@@ -404,8 +404,9 @@ class EmgTable(SceneTable):
     )
     use: Literal["report", "target", "bounds"] = Field(
         "report",
-        description="report: only reports the agreement with the activations; target: adds "
-        "weight (a - e)^2 to the cost; bounds: keeps a between e - width and e + width",
+        description="with the activation a and the envelope e: report: only reports their "
+        "agreement; target: adds weight (a - e)^2 to the cost; bounds: keeps a between e - width "
+        "and e + width",
     )
     weight: Positive | None = Field(None, description="with use = 'target': weight in the cost")
     width: Annotated[Number, Field(gt=0, le=1)] | None = Field(

@@ -229,7 +229,7 @@ def with_overrides(scene: Scene, overrides: dict[str, Any]) -> Scene:
 
 
 def _changed(content: dict[str, Any], overrides: dict[str, Any]) -> Scene:
-    """Return the scene with a content and overrides applied to it."""
+    """Return the scene of a scene file's content, after overrides are applied to the content."""
     _apply_overrides(content, overrides)
     try:
         result = Scene.model_validate(content)

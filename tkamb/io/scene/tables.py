@@ -160,7 +160,7 @@ BAND = (
 class MuscleWrapTable(SceneTable):
     """The sagittal outline that a muscle wraps: that of the femoral component and of `bone`.
 
-    The part of the path that leaves the femur passes in front of this outline.
+    The part of the path from its last point on the femur to the next link passes in front of it.
     """
 
     bone: BoneTable | None = None

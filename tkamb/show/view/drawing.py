@@ -138,8 +138,9 @@ class Strand:
     Args:
         name: unique within the drawing.
         layer: one of LAYERS.
-        points: points of the centre line, m, shape (f, m, 3) or (1, m, 3). The tube ends at a
-            repeated point.
+        points: points of the centre line, m, shape (f, m, 3) or (1, m, 3). A point may be
+            repeated: where the colour changes, and at the end of a path with fewer points.
+
         colours: colours at the points, 0 to 255, shape (f, m, 3) or (1, m, 3).
         radius: radius of the tube, m.
     """

@@ -293,7 +293,8 @@ class LiveKnee:
         if thickness_mm is None or (self.design and thickness_mm == self.design.thickness):
             return self.case
         if self.design is None:
-            raise InputError("of no parametric design", "thickness_mm", "leave it out")
+            what = "the insert has no parametric design"
+            raise InputError(what, "thickness_mm", "leave it out")
         if thickness_mm not in self._cases:
             self._cases[thickness_mm] = with_thickness(
                 self.case, self.design, thickness_mm, self._session
