@@ -21,7 +21,7 @@ FREE = np.inf
 
 
 def hamstring(name="hamstring", depth=-0.04, **numbers):
-    """Return a muscle that stays parallel to the shank: its arm about the knee is the depth."""
+    """Return a muscle parallel to the shank of a straight knee: its arm is then the depth."""
     ends = ("femur_r", [depth, -0.4, 0.0]), ("tibia_r", [depth, -0.3, 0.0])
     return muscle(name, *ends, **numbers)
 
@@ -154,6 +154,7 @@ def _line(model, knee):
 
 
 def test_a_length_twin_carries_no_force():
+    """A length twin is a copy of a muscle with fewer path points. Only its length is used."""
     twin = muscle("copy", ("femur_r", [0.0, -0.1, 0.0]), ("tibia_r", [0.05, -0.05, 0.0]))
     whole = muscle(
         "whole",

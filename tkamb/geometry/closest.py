@@ -88,7 +88,9 @@ class HeightBound:
         return planes
 
     def _covered(self, low: Array, high: Array) -> Iterator[tuple[Index, tuple[Index, Index]]]:
-        """Yield all cells under all rectangles: numbers of rectangles, rows and columns, (m,) each.
+        """Yield, in parts, all pairs of a rectangle and a grid cell that it covers.
+
+        Each part has (m,) numbers of rectangles, and (m,) rows and columns of their cells.
 
         Args:
             low: (n, 2) m, smallest x and z of the rectangles.
@@ -327,7 +329,7 @@ class _Condyle:
 
 
 class _CloseRegion:
-    """Part of one body's surface, prepared for the search of its close region with another body.
+    """Part of one body's surface, prepared to find the close region on another body.
 
     On conforming surfaces the closest point of two meshes moves by millimetres from pose to pose,
     although the gap changes by a few micrometres. The centre of the close region moves smoothly:

@@ -6,9 +6,9 @@ medial-lateral position if the scene releases them. A coordinate that is not rel
 recorded value. The force or moment that holds it is a residual of the equations of motion.
 
 The search is repeated in passes. Within one pass the patella is fixed to the femur, and the forces
-of the other muscles are constant. Then patella, lines and muscle forces are computed again at the
-new pose and contact. The passes end when the knee no longer moves between them. The tension of the
-extensor group then satisfies the knee's equations.
+of all muscles except the extensor group are constant. Then patella, lines and muscle forces are
+computed again at the new pose and contact. The passes end when the knee no longer moves between
+them. The tension of the extensor group then satisfies the knee's equations.
 
 Inertia and sliding speed use the recorded rates: the released coordinates are quasi-static. Coulomb
 friction is mu times the resultant of each condyle. It is opposite to the recorded sliding and acts
@@ -163,7 +163,7 @@ class ReleasedKnee:
             ComputationError: no muscle forces balance the frame.
         """
         coordinates, middle, force = np.array(start, float), np.array(start[:3]), np.full(3, np.nan)
-        # Every frame begins with a taut ligament, even if the ligament was slack in the last frame.
+        # Every frame begins with a taut patellar ligament, even if it was slack in the last frame.
         knee, slack, trials, passes = before, False, 0, 0
         last_contact, relaxation, distances = None, Relaxation(), [np.inf, np.inf]
         if instant.muscles and before:
@@ -244,7 +244,7 @@ class ReleasedKnee:
     def _at_load(
         self, coordinates: Array, target: "ProbedContact"
     ) -> "tuple[Array, ProbedContact | None]":
-        """Return coordinates with the height changed until the load is about that of a contact.
+        """Return coordinates with the height changed until the load is about that of `target`.
 
         Returns:
             Coordinates (6,), and the contact at these coordinates. The contact is None if other
@@ -333,17 +333,18 @@ class ReleasedKnee:
         applied: "MuscleShare | None",
         relaxation: Relaxation,
     ) -> "MuscleShare":
-        """Return the force of each muscle if the released coordinates depend on these forces.
+        """Return the force of each muscle, for a knee that moves when these forces change.
 
-        The contact points are constant if no equilibrium is known yet, or if the contact has no
-        tangent. If the equations are then singular, the contact force acts at the femoral origin.
+        If no equilibrium is known yet, or if the contact has no tangent, the contact points are
+        constant instead. If there is also no `last_contact` and these points give no muscle forces,
+        the contact force acts at the femoral origin.
 
         Args:
             instant: the knee at one instant.
             geometry: input of the equations, without the contact.
             joint: equations of the released coordinates with a taut extensor mechanism.
-            last_contact: the contact at this pose; None: no contact with about the load of the last
-                frame is known.
+            last_contact: the contact at this pose, from the last pass or from `_at_load`; None:
+                neither gave one, and the contact is computed here.
             applied: muscle forces of the last pass, in this frame or the previous frame.
             relaxation: relaxation of forces and compliance.
 
@@ -389,7 +390,7 @@ class ReleasedKnee:
         if self._external is None or self._external[0] is not instant:
             self._external = instant, external_wrench(geometry, coordinates)
         external = self._external[1]
-        # The patella was lost in this call. It may be found in the next call.
+        # Not finite: the patella was not found at this pose. The next call computes it again.
         if not np.isfinite(external).all():
             self._external = None
         return joint_equilibrium(

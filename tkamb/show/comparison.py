@@ -110,9 +110,9 @@ SETTINGS = {
     "scene_sha256": "scene (SHA-256 of all its keys)",
     "side": "side",
     "lateral_axis": "direction of insert z",
-    "body_mass_kg": "body mass, kg (1 BW differs)",
+    "body_mass_kg": "body mass, kg (so 1 BW is not the same force)",
     "height_mm": "body height, mm",
-    "yield_stress_MPa": "yield stress, MPa (areas above yield)",
+    "yield_stress_MPa": "yield stress, MPa (so areas above yield are not comparable)",
     "not_modelled": "not modelled",
     "assumptions": "assumptions",
 }

@@ -11,15 +11,16 @@ f_int are the internal forces of the displaced solid under its nonlinear law. p 
 points. One pass is a modified Newton step with the factorised linear stiffness K:
 
 1. Femoral points and normals: vertical rays through the displaced nodes.
-2. Contact: a primal-dual active set on the compliance of the candidate nodes. Gaps include the
-   displacement K⁻¹ h by the nonlinear loads h (`active_set.py`).
+2. Contact: a primal-dual active set on the compliance of the candidate nodes (`active_set.py`).
+   Gaps include the displacement K⁻¹ h. The nonlinear loads h are those of step 4 of the last pass;
+   at equilibrium h = K u - f_int(u).
 3. Displacement: K u = f + h. Residual: r = f - f_int(u) (`nonlinear_balance.py`).
 4. Next loads: h + s r, accelerated by Anderson's method. The softening s is the ratio of secant
    and tangent stiffness along u, so that K/s approximates the tangent stiffness.
 
 Passes evaluate only the region of the softened elements. When the residual there is within the
-tolerances, the whole solid is measured: r from the law of every element without any factor, and
-the gap with new rays at the displaced nodes. The iteration has converged when
+tolerances, the whole solid is measured: r from the law of every element, without the factorised
+K, and the gap with new rays at the displaced nodes. The iteration has converged when
 
     |r| / |f| <= force_tolerance
     s |r · u| / (f · u) <= work_tolerance,    s = (f_int(u) · u) / (uᵀ K_T u)
@@ -60,7 +61,7 @@ class Solution:
     """The state at which the iteration stopped, with its measured residual.
 
     Args:
-        candidates: positions of the candidates among the contact nodes, shape (m,).
+        candidates: indices of the candidates in the list of contact nodes, shape (m,).
         forces: contact forces along the normals, approach and active set.
         planes: femoral points and normals of the candidates.
         displacement: displacement of the candidates, m, shape (m, 3).
@@ -199,7 +200,7 @@ class SlidingNodes:
         return tangent_planes(self._problem, positions, self._pose, self.planes)
 
     def follow(self, displacement: Array, forces: ContactForces) -> float:
-        """Update the planes for a displacement (m, 3), m, and return its `gap`."""
+        """Update the planes for a displacement (m, 3), m. Return the same number as `gap`."""
         positions = self._points + displacement
         planes = self._planes_over(positions)
         relative_gap = self._relative_gap(planes, displacement, forces)

@@ -307,7 +307,7 @@ def link_inertias(links: Links, scale: float) -> dict[str, RigidInertia]:
 def _body_inertia(
     links: Links, body: str, base: str, link_pose: Array, scale: float
 ) -> RigidInertia:
-    """Return the inertia of a body in a link's frame, with the link's pose in body `base`."""
+    """Return the inertia of a body in a link's frame. `link_pose` is given in body `base`."""
     pose = np.linalg.inv(link_pose) @ links.leg.in_body(body, base)
     inertia, turn = links.leg.model.bodies[body], pose[:3, :3]
     tensor = scale * turn @ inertia.inertia @ turn.T

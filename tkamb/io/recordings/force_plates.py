@@ -49,8 +49,8 @@ class PlateSettings:
     """N: largest standard deviation of the vertical force of an unloaded plate, over the frames of
     ZERO. Chosen because a foot strike or toe-off gives more."""
     baseline_N: float = 20.0
-    """N: largest mean vertical force over the frames of ZERO that is drift of the amplifier. Chosen
-    because a foot exerts more."""
+    """N: largest mean vertical force, over the frames of ZERO, that counts as drift of the
+    amplifier. Chosen because a foot exerts more."""
     baseline_share: float = 0.2
     """1: as `baseline_N`, but a share of the largest change of the vertical force; the larger limit
     holds. Chosen because a standing person exerts more."""
@@ -334,7 +334,7 @@ class PlateLoadSettings:
     """N: largest range of these samples. A larger range gives no unloaded level. Chosen because the
     force of a foot varies more."""
     most_drift_N: float = 60.0
-    """N: largest unloaded level that is drift. Chosen because a larger force is that of a foot."""
+    """N: largest unloaded level that counts as drift. Chosen because a foot exerts more."""
     drift_N: float = 2.0
     """N: a larger unloaded level gets a note. Chosen because the median of noise is zero, and 2 N
     change the force of the knee by less than 0.5 % of a body weight."""

@@ -146,9 +146,9 @@ def _of_inertia(case: Case, link: str, end: Array) -> Iterator[Question]:
     radii = [float(np.sqrt(moment / mass)) / length for moment in (across, inside)]
     if not all(low <= radius <= high for radius, (low, high) in zip(radii, RADII, strict=True)):
         yield Question(
-            f"the radii of gyration of '{link}' are {radii[0]:.2f} across and {radii[1]:.2f} along "
-            "of its length, no limb's: are <inertia> and <mass> in kg·m² and kg, about the "
-            "centre of mass?",
+            f"the radii of gyration of '{link}' are {radii[0]:.2f} (across) and {radii[1]:.2f} "
+            "(along) of its length, which no limb has: are <inertia> and <mass> in kg·m² and kg, "
+            "about the centre of mass?",
             f"inertia of {link} unlike a limb's",
         )
 
@@ -165,15 +165,17 @@ class ImplantShapeLimitSettings:
     Eleven components have 0.92 to 0.97, one without a flange has 0.5, and a component that is back
     to front has less than 0.1."""
     min_opening_share: float = 0.05
-    """1: least distance from the surface's centroid to the centre of the bounding box, as a share
-    of the largest extent, from which the opening is checked. Ten components have 0.09 to 0.14, a
-    sphere has 0."""
+    """1: a component opens in the direction from its surface's centroid to the centre of its
+    bounding box. This direction is checked if that distance is more than this share of the largest
+    extent. Ten components have 0.09 to 0.14, a sphere has 0."""
     max_opening_angle: float = 60.0 * DEGREE
     """rad: largest angle between the opening of the component and superior. The same ten components
     have at most 27 deg."""
     min_flatness_ratio: float = 2.0
     """1: ratio of the flat area of the largest flat side of a patellar button to that of its
-    anterior side, above which the button may be turned. Real buttons have at least 15."""
+    anterior side, above which the button may be turned. The flat area of the bone side of a real
+    button is at least 15 times that of its joint side."""
+
     min_notch_share: float = 0.02
     """1: depth of the notch in front minus that behind, as a share of the insert's length, above
     which the insert may be back to front. Ten inserts have deeper notches behind, by 0.05 to

@@ -101,7 +101,7 @@ class Placement:
     slope_deg: float = 0.0
 
     def matrix(self) -> Array:
-        """Return pose_moved_in_original (4, 4) of a right knee."""
+        """Return the pose (4, 4) of the moved component in its original axes, for a right knee."""
         turn = Rotation.from_euler(
             "ZXY", [self.slope_deg, -self.varus_deg, -self.rotation_deg], degrees=True
         ).as_matrix()
@@ -222,7 +222,7 @@ def _placement(name: str, values: Any) -> Placement:
 def _released(values: Any) -> tuple[str, ...]:
     names = [name for name in KNEE_COORDINATES if name != "flexion"]
     if not isinstance(values, list | tuple) or any(name not in names for name in values):
-        raise InputError("released names no coordinates", "bench", f"of {', '.join(names)}")
+        raise InputError("'released' is no list of coordinates", "bench", f"of {', '.join(names)}")
     chosen = set(values) | ({"si"} if values else set())
     return tuple(name for name in names if name in chosen)
 
@@ -241,7 +241,7 @@ class Bench:
 
     @cached_property
     def bundles(self) -> "tuple[Ligament, ...]":
-        """Return the ligaments with both ends on the links "femur" and "tibia"."""
+        """Return all ligaments, each end given in the link of the bone that it is fixed to."""
         return tuple(
             replace(one, proximal=self._on_bone(one.proximal), distal=self._on_bone(one.distal))
             for one in self.ligaments
@@ -257,7 +257,8 @@ class Bench:
 
         Args:
             request: state of the bench.
-            height: function of the pose that returns y of the femoral origin, m; None: y = 0.
+            height: function of the pose that returns y of the femoral origin at first touch, m.
+                The component is placed `first_penetration` below it. None: y follows from si = 0.
             like: case with another insert; None: the case of the scene.
         """
         like = like or self.case

@@ -105,7 +105,10 @@ class CohortWearTable(SceneTable):
 
 
 class CohortTable(SceneTable):
-    """The cohort file. An axis without entries changes nothing."""
+    """The cohort file.
+
+    Its axes are subject, trial, design and contact. An axis without entries changes nothing.
+    """
 
     title: str = "Cohort"
     frames: str = Field(":", description="frames of every trial, as a Python slice A:B:STEP")
@@ -338,7 +341,7 @@ def _complaint(error: ValidationError, path: Path) -> InputError:
 
 
 def _keys_beside(location: tuple[int | str, ...]) -> list[str]:
-    """Return the keys of the table of the cohort file that contains a key."""
+    """Return the keys that are allowed in the table where an unknown key stands."""
     tables: dict[int | str, type[SceneTable]] = {
         "subject": SubjectTable,
         "trial": TrialTable,

@@ -112,7 +112,7 @@ class ContactEngine:
             return result if np.isfinite(result) else 1.0
 
         middle = self.femoral.moved(pose_of(rotation, [0.0] * 3)).bounds.mean(axis=0)
-        # one grid is around the femoral origin, the other around the middle of the femoral bounds
+        # around the origin of the insert frame: first the femoral origin, then the bounds' middle
         guesses = [
             np.array([x, z]) - offset
             for offset in (np.zeros(2), middle[[0, 2]])
