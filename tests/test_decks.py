@@ -113,7 +113,7 @@ def test_a_deck_states_its_differences_from_the_run(folder, pressed, tmp_path, c
         out = tmp_path / f"frame.{suffix}"
         assert main(["export", str(other), "--deck", kind, "--frame", "0", "--out", str(out)]) == 0
         output = capsys.readouterr().out
-        for words in ("not in this deck: 123 N, peak 9.5 MPa", "computed as its mirror image"):
+        for words in ("not in this deck: 123 N, peak 9.5 MPa", "show its mirror image"):
             assert words in out.read_text() and words in output
         assert "z medial" in out.read_text()
     assert main(["export", str(other), "--vtp", "--out", str(tmp_path / "vtp")]) == 0
