@@ -228,3 +228,23 @@ def test_an_interrupt_within_a_compiled_loop_is_a_keyboard_interrupt():
         loop(KeyboardInterrupt())
     with pytest.raises(SystemError), interrupt_as_such():
         loop(ValueError())
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        (["--axes", "-x,+y,-z"], "write --mesh-axes=VALUE if the value begins with -"),
+        (["--pose=0,30,1"], "give 6 values, with spaces between"),
+    ],
+)
+def test_a_value_that_the_parser_does_not_read_has_a_remedy(capsys, value, words):
+    with pytest.raises(SystemExit) as ended:
+        main(["press", "femoral.stl", "insert.stl", "--load", "100", *value])
+    assert ended.value.code == 2
+    assert words in capsys.readouterr().err
+
+
+def test_a_folder_of_a_scene_has_its_run_as_remedy(tmp_path, capsys):
+    (tmp_path / "scene.toml").touch()
+    assert main(["report", str(tmp_path)]) == 2
+    assert f"tkamb run {tmp_path / 'scene.toml'}" in capsys.readouterr().err

@@ -147,6 +147,13 @@ def test_a_quarter_of_the_quick_study_has_no_failure():
     assert Counter(v.kind for v in verdicts)["converged"] > 0.7 * len(verdicts)
 
 
+def test_a_thin_insert_of_coarse_cells_is_refused_for_its_volume():
+    thin = [case for case in stability_cases(quick=True) if "thickness_mm=0.5" in case.label]
+    (verdict,) = run_stability(thin)
+    assert verdict.kind == "flagged" and not verdict.failed
+    assert "less volume than the mesh" in verdict.reason
+
+
 def test_stored_verdicts_are_not_computed_again(tmp_path):
     kept = KeptRows(tmp_path, resume=False)
     cases = [replace(SMALL, model="foundation"), replace(SMALL, model="nothing")]

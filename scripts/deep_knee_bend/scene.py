@@ -97,8 +97,7 @@ axis = "flexion"
 activity = "squat"  # of instrumented knees, for the report
 notes = [
   "Nobody was measured: geometry, motion and ground reaction are made to fit each other.",
-  "The knee does not move in the first and in the last frame, so that friction is zero there.",
-  "Therefore the residuals change abruptly at these two frames.",
+  "Without motion in the first and last frame, friction is zero and the residuals jump.",
 ]
 """
 

@@ -33,6 +33,9 @@ class ImplicitStepSettings:
     velocity_tolerance: float = 1e-8
     """m/s and rad/s: residual of the step's equation below which Newton's method has converged.
     Chosen because it is far below any speed of a knee."""
+    stagnation_tolerance: float = 1e-5
+    """m/s and rad/s: residual below which the step is accepted if Newton's method no longer reduces
+    it. Chosen as a thousand times `velocity_tolerance`."""
     max_newton_steps: int = 40
     """Maximum number of Newton steps. Chosen because a time step that converges needs fewer."""
 
@@ -100,7 +103,7 @@ def implicit_step(
         residual = v_end - v - step * pin.aba(model, cache, q_middle, v_middle, torque, forces)
         residual_norm = float(np.abs(residual).max())
         if residual_norm < IMPLICIT_STEP.velocity_tolerance or (
-            residual_norm < 1e3 * IMPLICIT_STEP.velocity_tolerance and residual_norm >= last_norm
+            last_norm <= residual_norm < IMPLICIT_STEP.stagnation_tolerance
         ):
             return pin.integrate(model, q, step * v_middle), v_end
         if residual_jacobian is None or residual_norm > REUSE_BELOW * last_norm:

@@ -39,8 +39,8 @@ class MapWriteSettings:
     """How pressure maps are written."""
 
     buffer_bytes: float = 4e6
-    """bytes: size of the maps that are collected for one write. More means fewer writes, but
-    more frames lost if the process is killed."""
+    """bytes: size of the maps that are collected for one write. Chosen because a write takes
+    as long as the maps of a frame."""
 
 
 MAP_WRITE = MapWriteSettings()

@@ -21,7 +21,7 @@ ANY_KEY = "*"
 
 
 @dataclass(frozen=True)
-class SummaryLimits:
+class SummaryCheckSettings:
     """Limits of the values in a summary."""
 
     largest_number: float = 1e15
@@ -30,7 +30,7 @@ class SummaryLimits:
     """1: largest depth of nested objects and lists. tkamb writes seven."""
 
 
-LIMITS = SummaryLimits()
+SUMMARY_CHECK = SummaryCheckSettings()
 
 
 def optional(kinds: Mapping[str, Kind]) -> dict[str, Kind]:
@@ -278,13 +278,13 @@ def _check_depth(value: object, path: object) -> None:
     unchecked: list[tuple[object, int]] = [(value, 0)]
     while unchecked:
         one, depth = unchecked.pop()
-        if depth > LIMITS.deepest:
-            raise InputError(f"nests values more than {LIMITS.deepest} deep", path)
+        if depth > SUMMARY_CHECK.deepest:
+            raise InputError(f"nests values more than {SUMMARY_CHECK.deepest} deep", path)
         if isinstance(one, Mapping):
             unchecked += [(item, depth + 1) for item in one.values()]
         elif isinstance(one, list):
             unchecked += [(item, depth + 1) for item in one]
-        elif isinstance(one, int | float) and not abs(one) <= LIMITS.largest_number:
+        elif isinstance(one, int | float) and not abs(one) <= SUMMARY_CHECK.largest_number:
             raise InputError("holds a number that is not finite or beyond 1e15", path)
 
 

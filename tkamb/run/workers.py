@@ -45,7 +45,7 @@ class ClusterSettings:
 
 CLUSTER = ClusterSettings()
 
-LOST = "what is finished is kept: go on with resume=True"
+FINISHED_KEPT = "what is finished is kept: go on with resume=True"
 
 
 def answers_of_cluster(
@@ -137,15 +137,17 @@ def _answers(
         }
         for future in distributed.as_completed(futures):
             if future.cancelled():
-                raise ComputationError("the Dask scheduler has ended", "--dask", LOST)
+                raise ComputationError("the Dask scheduler has ended", "--dask", FINISHED_KEPT)
             yield futures.pop(future), future.result()
     except distributed.KilledWorker:
         what = f"a job killed {CLUSTER.most_deaths} workers"
         raise ComputationError(
-            what, "--dask", f"check that a worker has enough memory; {LOST}"
+            what, "--dask", f"check that a worker has enough memory; {FINISHED_KEPT}"
         ) from None
     except OSError as error:  # includes Dask's CommClosedError
-        raise ComputationError(f"the Dask scheduler has ended ({error})", "--dask", LOST) from None
+        raise ComputationError(
+            f"the Dask scheduler has ended ({error})", "--dask", FINISHED_KEPT
+        ) from None
 
 
 _one_at_a_time = threading.Lock()
@@ -185,7 +187,6 @@ WORKER_LIMITS = WorkerLimitSettings()
 Numbered = tuple[int, Any]
 Progress = Callable[[Iterable[Numbered], int], Iterable[Numbered]]
 ENDED = "a worker process ended before its job was done"
-KEPT = "what is finished is kept: go on with resume=True"
 
 
 @dataclass(frozen=True)
@@ -352,7 +353,7 @@ def _attend(
             _send(process.stdin, job)
             answers.put(pickle.load(process.stdout))
     except (OSError, EOFError, ValueError, pickle.UnpicklingError):
-        hint = f"check that there is enough memory; {KEPT}"
+        hint = f"check that there is enough memory; {FINISHED_KEPT}"
         answers.put(ComputationError(ENDED, "workers", hint))
 
 

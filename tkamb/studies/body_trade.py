@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 class BodyTradeSettings:
     """Frames that the study compares."""
 
-    recorded_frames: int = 101
-    """Number of frames of the shipped motion."""
     stride: int = 10
     """Recorded frames from one compared frame to the next. Chosen because every frame rate of the
     study contains these frames."""

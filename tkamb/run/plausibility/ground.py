@@ -45,7 +45,8 @@ class GroundReactionLimitSettings:
     0.019 to 0.061, and -0.019 or less with the opposite sign."""
     ankle_distance: float = 0.015
     """m: horizontal distance from the ankle. A centre of pressure that stays within it is likely
-    in another unit. In standing it is 0.04 m away."""
+    in another unit. In standing it is 0.04 m ahead of the
+    ankle."""
     max_unloaded_stance: float = 0.15
     """s: longest time without force on a standing foot. Four recorded walks have at most 0.02 s.
     A missing force plate causes 0.4 s."""
