@@ -6,7 +6,9 @@ import shutil
 import numpy as np
 import pytest
 
+from interrupted_runs import held_elsewhere
 from scenes import write_scene
+from tkamb import files
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.run.recorder import Shard, Shards
@@ -177,16 +179,47 @@ def test_a_symbolic_link_in_place_of_the_frames_folder_is_refused(tmp_path):
 
 
 def test_a_second_run_in_a_folder_at_the_same_time_is_refused(run, capfd):
-    from tkamb.io import claim
-
     scene, out = run
-    descriptor = claim._acquire_lock(out)  # stands for the lock of another process
-    try:
+    with held_elsewhere(out):
         assert main(["run", str(scene / "scene.toml"), "--out", str(out), "--frames", "0:1"]) == 2
-    finally:
-        claim.os.close(descriptor)
     output = capfd.readouterr().err
     assert "another tkamb is writing" in output and output.count("\n") == 1
+    assert verified(out, capfd)[0] == 0
+
+
+@pytest.mark.parametrize("command", ["verify", "methods", "view", "compare", "export"])
+def test_a_reader_changes_nothing_in_a_folder_with_a_journal(
+    run, tmp_path, capfd, monkeypatch, command
+):
+    """A journal of someone else could name the user's files."""
+    monkeypatch.setattr(files, "LONGEST_WAIT", 0.0)
+    out = run[1]
+    journal = {"written": {"results.csv": "mine.csv"}, "removed": ["summary.json", "mine.csv"]}
+    (out / files.JOURNAL).write_text(json.dumps(journal))
+    (out / "mine.csv").write_text("mine")
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    more = {
+        "view": ["--html", str(tmp_path / "page.html")],
+        "compare": [str(out), "--out", str(tmp_path / "compared")],
+        "export": ["--vtp", "--out", str(tmp_path / "maps")],
+    }
+    assert main([command, str(out), *more.get(command, [])]) == 2
+    message = capfd.readouterr().err
+    assert files.JOURNAL in message and "tkamb report" in message
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    assert main(["report", str(out)]) == 2
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+
+
+def test_a_report_completes_the_writing_of_a_killed_run(run, capfd):
+    out = run[1]
+    content = (out / "results.csv").read_bytes()
+    part = ".tkamb-0123456789ab.part"
+    (out / "results.csv").rename(out / part)
+    journal = {"written": {"results.csv": part}, "removed": ["report.html"]}
+    (out / files.JOURNAL).write_text(json.dumps(journal))
+    assert main(["report", str(out)]) == 0
+    assert (out / "results.csv").read_bytes() == content
     assert verified(out, capfd)[0] == 0
 
 

@@ -174,10 +174,11 @@ def _verify(options: argparse.Namespace) -> int:
 
 
 def _report(options: argparse.Namespace) -> int:
-    from tkamb.io.claim import claimed_directory
+    from tkamb.io.claim import claimed_directory, settle
     from tkamb.run.results_folder import REPORT_NAME, read_results
     from tkamb.show.report import write_report
 
+    settle(options.folder)
     results = read_results(options.folder)  # an unreadable folder must stay unchanged
     with claimed_directory(options.folder) as folder:
         write_report(results, folder / REPORT_NAME)

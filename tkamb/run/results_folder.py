@@ -18,14 +18,16 @@ from tkamb.files import (
     FILE_LIMITS,
     MEGABYTE,
     Replacement,
+    check_replaced,
     read_json,
     replaced_together,
     sha256_of,
+    write_rows,
     write_synced,
 )
-from tkamb.io.claim import claimed_directory, settle
+from tkamb.io.claim import claimed_directory
 from tkamb.run.identity import CONTACT_CODE, contact_code
-from tkamb.run.results import Results, csv_text, read_bands, read_csv
+from tkamb.run.results import Results, csv_rows, read_bands, read_csv
 from tkamb.run.summary_check import check_summary
 
 if TYPE_CHECKING:
@@ -49,17 +51,15 @@ SUMMARY_LIMIT = 256 * MEGABYTE
 def read_results(directory: str | Path, *, check: bool = True) -> Results:
     """Read results from a folder. The numbers are exactly the written ones.
 
-    If writing was interrupted, it is completed first.
-
     Args:
-        directory: results folder.
+        directory: results folder. Nothing is written into it.
         check: whether to compare the files with the SHA-256 in summary.json.
 
     Raises:
         InputError: a file is missing, has a wrong format, or has changed since it was written.
     """
     directory = Path(directory)
-    settle(directory)
+    check_replaced(directory)
     if not os.path.exists(directory / CSV_NAME):  # unlike Path.exists, it never raises
         hint = "give a folder that `tkamb run` wrote"
         if os.path.exists(scene := directory / "scene.toml"):
@@ -168,7 +168,7 @@ def put_numbers(results: Results, files: Replacement) -> None:
         files: replacement of the folder's files. A contact.h5 of the folder is kept if the
             replacement has none; old files of `UNCERTAINTY_NAMES` are removed.
     """
-    write_synced(files.path(CSV_NAME), csv_text(results.columns))
+    write_rows(files.path(CSV_NAME), csv_rows(results.columns))
     recorded = {CSV_NAME: sha256_of(files.path(CSV_NAME))}
     if results.maps is None:
         files.remove(MAPS_NAME)
@@ -241,13 +241,13 @@ class Verdict:
 def verify_results(directory: str | Path) -> Verdict:
     """Compare a folder with the SHA-256 in its summary.json.
 
-    If writing was interrupted, it is completed first.
+    Nothing is written.
 
     Raises:
         InputError: it is not a results folder.
     """
     directory = Path(directory)
-    settle(directory)
+    check_replaced(directory)
     summary = read_summary(directory)
     if not isinstance(summary.get("versions"), Mapping):
         raise InputError("was not written by tkamb run", directory / SUMMARY_NAME)

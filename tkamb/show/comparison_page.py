@@ -172,7 +172,7 @@ def _map_at(results: "Results", frame: int) -> Array | None:
     row = map_rows(results).get(frame)
     if results.maps is None or row is None:
         return None
-    return results.maps.pressure_Pa[row] / MEGAPASCAL
+    return results.maps.rows("pressure_Pa", [row])[0] / MEGAPASCAL
 
 
 def _map_figure(

@@ -234,13 +234,19 @@ def _runs(frames: Sequence[int]) -> list[tuple[int, int]]:
 
 
 def _stretches(frames: Sequence[int]) -> str:
-    return ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in _runs(frames))
+    return _listed([str(a) if a == b else f"{a}–{b}" for a, b in _runs(frames)])
 
 
 def _positions(frames: Sequence[int], axis: HorizontalAxis) -> str:
-    return ", ".join(
-        axis.at(a) if a == b else f"{axis.at(a)} to {axis.at(b)}" for a, b in _runs(frames)
+    return _listed(
+        [axis.at(a) if a == b else f"{axis.at(a)} to {axis.at(b)}" for a, b in _runs(frames)]
     )
+
+
+def _listed(stretches: list[str]) -> str:
+    """Return the stretches as text; of many, the first and their number."""
+    more = len(stretches) - STRETCHES_SHOWN
+    return ", ".join(stretches[:STRETCHES_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
 def _entries(results: "Results", axis: HorizontalAxis) -> list[Entry]:
@@ -276,6 +282,8 @@ def _number(value: float, digits: int) -> str:
     return text.removeprefix("-") if float(text) == 0 else text.replace("-", "−")
 
 
+STRETCHES_SHOWN = 60
+"""1: stretches of frames that a table lists. Not studied."""
 WEAR_NAME, PICTURE_NAME, WORN_NAME = "wear.json", "wear.png", "wear.vtp"
 
 

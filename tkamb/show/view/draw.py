@@ -99,10 +99,10 @@ def _pressure_map(results: "Results", rows: list[int]) -> PressureMap | None:
         return None
     missing = np.full(len(maps.points_m), np.nan)
     pressure, gap = (
-        np.stack([stored[row] if row >= 0 else missing for row in rows])
-        for stored in (maps.pressure_Pa / MEGAPASCAL, maps.gap_m)
+        np.stack([maps.rows(name, [row])[0] if row >= 0 else missing for row in rows])
+        for name in ("pressure_Pa", "gap_m")
     )
-    return PressureMap(maps.points_m, maps.triangles, pressure, gap)
+    return PressureMap(maps.points_m, maps.triangles, pressure / MEGAPASCAL, gap)
 
 
 def lattice_lines(case: Case) -> Array:

@@ -23,7 +23,7 @@ from tkamb.io.scene.case import Case, load_case
 from tkamb.run.columns import KINDS
 from tkamb.run.guard import interrupt_as_such
 from tkamb.run.recorded import predicted_columns
-from tkamb.run.recorder import Shard, Shards, have
+from tkamb.run.recorder import Shard, Shards
 from tkamb.run.results import STATISTICS_LIMITS, Results
 from tkamb.run.results_folder import (
     BANDS_NAME,
@@ -283,8 +283,7 @@ class _Job:
         """Compute the samples that are not stored yet and return the result of all samples."""
         names = banded_names(self.nominal)
         count = len(self.points)
-        shape = (len(names), len(self.nominal), len(self.inputs))
-        samples = _stored(shards, count, shape)
+        samples = _stored(shards, count)
         remaining = [n for n in range(count) if n not in samples]
         new = self.team.answers([(n, (self.points[n], names)) for n in remaining])
         try:
@@ -366,22 +365,12 @@ def banded_names(results: Results) -> list[str]:
     ]
 
 
-def _stored(shards: Shards | None, count: int, shape: tuple[int, int, int]) -> dict[int, Sample]:
+def _stored(shards: Shards | None, count: int) -> dict[int, Sample]:
     samples: dict[int, Sample] = {}
     if shards is None or not shards.resumed:
         return samples
     for number in range(count):
-        shard = shards.get(number, lambda stored: _is_sample(stored.contact or {}, shape))
+        shard = shards.get(number)
         if shard is not None and shard.contact is not None:
             samples[number] = Sample(**shard.contact)
     return samples
-
-
-def _is_sample(arrays: Mapping[str, Array], shape: tuple[int, int, int]) -> bool:
-    names, frames, inputs = shape
-    expected = {
-        "values": ("f", (names, frames)),
-        "problems": ("U", (frames,)),
-        "errors": ("f", (frames, inputs)),
-    }
-    return have(arrays, expected) and bool(np.isfinite(arrays["errors"]).all())

@@ -253,8 +253,7 @@ class _Track(NamedTuple):
 
     @classmethod
     def of_maps(cls, maps: ContactMaps) -> "_Track":
-        load = -np.asarray(maps.nodal_force_N)[:, :, 1].sum(axis=1)
-        return cls(np.asarray(maps.time_s), np.asarray(maps.femoral_pose), load)
+        return cls(np.asarray(maps.time_s), np.asarray(maps.femoral_pose), -maps.forces_N[:, 1])
 
 
 def _cycle_of(
