@@ -95,8 +95,8 @@ def test_a_damaged_csv_is_refused_with_the_line_or_column(tmp_path):
     path.write_text(text + "1,2,3\n")
     with pytest.raises(InputError, match="line 7 has 3 cells"):
         read_results(tmp_path)
-    path.write_text(text.replace("3.0,", "three,"))
-    with pytest.raises(InputError, match="time_s"):
+    path.write_text(text.replace("\n3.0,", "\nthree,"))
+    with pytest.raises(InputError, match=r"'time_s'.*'three'"):
         read_results(tmp_path)
     path.unlink()
     with pytest.raises(InputError, match="holds no results"):

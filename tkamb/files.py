@@ -502,7 +502,8 @@ def undamaged(path: str | Path, hint: str = "run it again") -> Iterator[None]:
     except MemoryError:
         raise InputError("needs more memory than there is", path, hint) from None
     except Exception as error:
-        lines = str(error).strip("'\"").splitlines() or [type(error).__name__]
+        words = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
+        lines = words.splitlines() or [type(error).__name__]
         raise InputError(f"is damaged: {lines[0][:200]}", path, hint) from None
 
 

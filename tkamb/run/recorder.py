@@ -374,18 +374,23 @@ class FolderRecorder(Recorder):
 
 @contextmanager
 def interrupt_later() -> Iterator[None]:
-    """Delay Ctrl-C until the end of the block."""
+    """Delay Ctrl-C and SIGTERM until the end of the block."""
     if threading.current_thread() is not threading.main_thread():  # only it receives signals
         yield
         return
     received: list[Any] = []
-    handler = signal.signal(signal.SIGINT, lambda *arguments: received.append(arguments))
+    handlers = {
+        number: signal.signal(number, lambda *arguments: received.append(arguments))
+        for number in (signal.SIGINT, signal.SIGTERM)
+        if callable(signal.getsignal(number))
+    }
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, handler)
-    if received and callable(handler):
-        handler(*received[0])
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    for number, frame in received[:1]:
+        handlers[number](number, frame)  # type: ignore[operator]
 
 
 def finished_results(directory: Path, identity: Mapping[str, Any]) -> "Results | None":

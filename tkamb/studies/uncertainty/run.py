@@ -186,7 +186,7 @@ def estimate_uncertainty(
         scene: scene, or the path of its file.
         samples: number of samples, at least 20.
         workers: number of processes; 1: compute in this process.
-        dask: address of a Dask scheduler, or "local" for a scheduler on this computer with
+        dask: address of a Dask scheduler, or "local" for worker processes on this computer,
             `workers` processes.
         method: "lhs" or "sobol", see `tkamb.studies.uncertainty.sampling`.
         indices: whether to compute Sobol' indices with Saltelli's design. With d inputs
