@@ -1,5 +1,6 @@
 """Jobs on a Dask cluster: the same results as in this process, also after a crash."""
 
+import functools
 import json
 import os
 import signal
@@ -63,7 +64,7 @@ def test_a_missing_scheduler_is_an_error_of_one_line(address, tmp_path, monkeypa
 
 def test_dask_local_listens_on_no_port():
     """A scheduler would serve addresses and folders by HTTP to every user of the machine."""
-    task, jobs = Task(Adder, (1,)), [(n, n) for n in range(3)]
+    task, jobs = Task(functools.partial, (max,)), [(n, n) for n in range(3)]
     crew = PoolOptions(2, "local")
     with crew.team(task, len(jobs)) as team:
         answers = dict(team.answers(jobs))
@@ -77,7 +78,7 @@ def test_dask_local_listens_on_no_port():
                 with suppress(OSError):
                     listening |= {inode for inode in inodes if f"[{inode}]" in os.readlink(file)}
         assert not listening
-    assert {n: total for n, (_, total, _) in answers.items()} == {0: 1, 1: 2, 2: 3}
+    assert answers == {0: 0, 1: 1, 2: 2}
 
 
 def test_without_dask_the_error_gives_the_install_command(monkeypatch):
