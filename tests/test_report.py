@@ -18,7 +18,7 @@ from tkamb.errors import InputError
 from tkamb.run import metrics
 from tkamb.run.metrics import map_rows
 from tkamb.run.results import PERCENTILES, Results
-from tkamb.show.axis import horizontal_axis, round_step
+from tkamb.show.axis import horizontal_axis, round_step, shown_frames
 from tkamb.show.headline import cards
 from tkamb.show.panels import Line, Panel, panels
 from tkamb.show.plots import WIDTH, Sheet
@@ -736,3 +736,19 @@ def test_the_outline_of_the_insert_has_no_steps():
     assert np.abs(np.diff(edge)).max() < 1.0
     inside = np.pad(view.grey >= 0, 8)
     assert opacity.sum() == pytest.approx(inside.sum(), rel=0.02)
+
+
+def test_the_page_of_a_long_recording_shows_a_few_hundred_frames_and_says_so(monkeypatch):
+    monkeypatch.setattr("tkamb.show.axis.EVENLY_SHOWN", 20)
+    monkeypatch.setattr("tkamb.show.report.EVENLY_SHOWN", 20)
+    sizes = []
+    for frames in (60, 240):
+        run = make_run("bend", frames, maps=False)
+        run.columns["quadriceps_N"][33] = 1e5
+        shown = shown_frames(run)
+        assert {0, 33, frames - 1} <= {*shown.tolist()} and len(shown) < 60
+        text = report_html(run)
+        assert f"show {len(shown)} of the {frames} computed frames" in text
+        sizes.append(len(text))
+    assert sizes[1] < 1.05 * sizes[0]
+    assert len(shown_frames(make_run("bend", 12, maps=False))) == 12

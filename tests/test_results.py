@@ -5,19 +5,23 @@ import os
 import signal
 import subprocess
 import sys
+import tracemalloc
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
+from kept_runs import keep
 from synthetic_run import make_run
 from tkamb.errors import InputError
 from tkamb.files import claim_directory
 from tkamb.run.columns import COLUMNS, columns_as_markdown, is_ligament, ligament_of
 from tkamb.run.maps import ContactMaps, MapWriter, read_maps, write_maps
+from tkamb.run.metrics import map_rows
 from tkamb.run.results import Results, csv_rows, read_csv
 from tkamb.run.results_folder import read_results, write_results
+from tkamb.run.tabulate import RowTable
 
 ROOT = Path(__file__).parents[1]
 
@@ -212,3 +216,35 @@ def test_any_error_of_h5py_on_a_damaged_file_is_an_input_error(tmp_path, monkeyp
     monkeypatch.setattr(h5py.Group, "__contains__", broken)
     with pytest.raises(InputError, match=r"contact.h5: is damaged: bad object header"):
         read_maps(tmp_path / "contact.h5")
+
+
+def test_memory_for_a_long_recording_hardly_grows_with_its_frames(tmp_path, monkeypatch):
+    """100,000 frames of the shipped knee, 3,132 points each, would have 12 GB of maps."""
+    monkeypatch.setattr("tkamb.run.maps.BLOCK_BYTES", 1e6)
+    peaks = []
+    for frames in (200, 800):
+        run = make_run("bend", frames)
+        folder = keep(run, tmp_path / str(frames))
+        tracemalloc.start()
+        table = RowTable()
+        for k in range(frames):
+            table.add(k, {name: values[k] for name, values in run.columns.items()})
+        results = read_results(folder)
+        assert len(map_rows(results)) == frames
+        np.testing.assert_array_equal(results.maps.peaks_Pa, run.maps.pressure_Pa.max(axis=1))
+        np.testing.assert_allclose(results.maps.forces_N, run.maps.nodal_force_N.sum(axis=1))
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    per_frame = (peaks[1] - peaks[0]) / 600
+    assert 100_000 * per_frame < 5e8
+    assert per_frame < 0.2 * 8 * 5 * len(run.maps.points_m)
+
+
+def test_a_row_table_has_the_rows_in_the_order_of_the_frames():
+    table = RowTable()
+    table.add(4, {"time_s": 0.4, "status": "ok"})
+    table.add(2, {"time_s": 0.2, "flexion_deg": 5.0, "status": "failed: x"})
+    columns = table.columns(None, range(2, 5, 2))
+    assert columns["time_s"].tolist() == [0.2, 0.4] and columns["status"] == ["failed: x", "ok"]
+    assert columns["flexion_deg"][0] == 5.0 and np.isnan(columns["flexion_deg"][1])
+    assert len(table) == 2 and 2 in table and 3 not in table

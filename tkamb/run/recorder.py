@@ -390,7 +390,8 @@ def interrupt_later() -> Iterator[None]:
         for number, handler in handlers.items():
             signal.signal(number, handler)
     for number, frame in received[:1]:
-        handlers[number](number, frame)  # type: ignore[operator]
+        if callable(handler := handlers[number]):
+            handler(number, frame)
 
 
 def finished_results(directory: Path, identity: Mapping[str, Any]) -> "Results | None":
