@@ -82,3 +82,11 @@ def test_a_scene_with_a_byte_order_mark_is_read(tmp_path):
     plain = load_scene(scene)
     scene.write_bytes(b"\xef\xbb\xbf" + scene.read_bytes())
     assert load_scene(scene) == plain
+
+
+def test_a_recording_of_one_row_is_named(tmp_path, capfd):
+    scene = lay_out(tmp_path / "knee")
+    motion = scene.parent / "motion.csv"
+    motion.write_text("".join(motion.read_text().splitlines(True)[:2]))
+    assert main(["run", str(scene), "--out", str(tmp_path / "out")]) == 2
+    assert "holds 1 row of motion" in capfd.readouterr().err
