@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -62,6 +62,8 @@ CONTACT_PLACES = ("contact_points", "contact_normals")
 patella; NaN without contact."""
 
 Row = dict[str, Any]
+T = TypeVar("T")
+FORGET_FRAME = "remove it, or leave out resume=True to begin again"
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,9 +154,19 @@ class Shards:
         digest, content = packed[:32], packed[32:]
         if self._digest(frame, content) != digest:
             return None
-        with undamaged(path, "remove it, or leave out resume=True to begin again"):
+        with undamaged(path, FORGET_FRAME):
             arrays = read_arrays(content)
             return Shard(dict(json.loads(arrays.pop("row").tobytes())), arrays or None)
+
+    def read(self, frame: int, make: Callable[[Shard], T]) -> T | None:
+        """Return what `make` returns for a frame; None: as `get`.
+
+        Raises:
+            InputError: the frame has the right SHA-256, but `make` cannot use it.
+        """
+        shard = self.get(frame)
+        with undamaged(self._path(frame), FORGET_FRAME):
+            return None if shard is None else make(shard)
 
     def _digest(self, frame: int, content: bytes) -> bytes:
         digest = hashlib.sha256(f"{frame}\n{self._identity}\n".encode())

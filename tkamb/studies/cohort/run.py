@@ -285,7 +285,7 @@ def _stored(folders: list[Shards], numbers: list[int]) -> dict[int, Outcome]:
     result: dict[int, Outcome] = {}
     for shards in folders:
         for number in numbers if shards.resumed else ():
-            shard = shards.get(number)
-            if shard is not None:
-                result[number] = Outcome.of(shard)
+            outcome = shards.read(number, Outcome.of)
+            if outcome is not None:
+                result[number] = outcome
     return result

@@ -370,7 +370,7 @@ def _stored(shards: Shards | None, count: int) -> dict[int, Sample]:
     if shards is None or not shards.resumed:
         return samples
     for number in range(count):
-        shard = shards.get(number)
-        if shard is not None and shard.contact is not None:
-            samples[number] = Sample(**shard.contact)
+        sample = shards.read(number, lambda shard: Sample(**(shard.contact or {})))
+        if sample is not None:
+            samples[number] = sample
     return samples
