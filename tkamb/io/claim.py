@@ -97,7 +97,6 @@ def _rows_of(folder: Path) -> tuple[str, str]:
 
 
 CHOOSE = "choose another directory"
-NOTE = "tkamb writes its results into this folder and may replace them\n"
 
 
 @contextmanager
@@ -130,7 +129,6 @@ def claimed_directory(path: str | Path, force: bool = False, command: str = "") 
         fresh, held_before = not os.path.lexists(path / MARKER), set(os.listdir(path))
         with _holding(lock, path):
             try:
-                (path / MARKER).write_text(NOTE, encoding="utf-8")
                 finish_replacement(path)
                 _remove_temporaries(path)
                 if command and not force:
