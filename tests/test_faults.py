@@ -13,9 +13,9 @@ from lattice_blocks import block
 from scenes import write_scene
 from tkamb.cli import main
 from tkamb.errors import InputError
+from tkamb.io.claim import settle
 from tkamb.io.scene import Scene
 from tkamb.io.vtk import write_hexahedra
-from tkamb.io.claim import settle
 from tkamb.run.results_folder import read_results, verify_results
 from tkamb.studies.kept_rows import KeptRows
 
