@@ -17,6 +17,7 @@ from tkamb.io.recordings.gait_cycle import GAIT, cycle_percent
 from tkamb.io.scene.case import Case
 from tkamb.io.scene.scene import Scene
 from tkamb.io.scene.tables import ContactTable, MusclesTable
+from tkamb.run.claims import claims_summary
 from tkamb.run.columns import (
     ACTIVATION,
     JOINT_MOMENT,
@@ -30,7 +31,6 @@ from tkamb.run.discrepancy import discrepancy_summary
 from tkamb.run.identity import scene_hash
 from tkamb.run.known_errors import as_json, known_error, left_out
 from tkamb.run.read_scene import STRAIN_FLEXIONS
-from tkamb.run.recorded import predicted_columns
 from tkamb.run.settings import changed_settings
 from tkamb.run.status import FAILED
 from tkamb.units import DEGREE, MILLIMETRE
@@ -100,7 +100,7 @@ def summary_of(
     if scene.muscles:
         summary["reserves"] = reserves(columns)
         summary["saturated_muscles"] = saturated_muscles(columns)
-    summary["peaks_BW"] = peaks(columns, case.body_weight)
+    summary |= claims_summary(columns, case.body_weight)
     summary["measures"] = measures(case, columns)
     if scene.contact or scene.muscles:
         summary["discrepancy"] = discrepancy_summary(summary)
@@ -429,27 +429,6 @@ def saturated_muscles(columns: Mapping[str, Any]) -> dict[str, int]:
             frames = int((np.asarray(values) > SATURATED).sum())
             if frames:
                 result[name_in(column, ACTIVATION)] = frames
-    return result
-
-
-def peaks(columns: Mapping[str, Any], body_weight: float) -> dict[str, dict[str, float]]:
-    """Return force -> its largest value, BW, with frame, time and flexion.
-
-    Args:
-        columns: columns of results.csv.
-        body_weight: body weight, N.
-    """
-    result = {}
-    for force, name in predicted_columns(columns).items():
-        values = columns.get(name)
-        if values is not None and np.isfinite(values).any():
-            frame = int(np.nanargmax(values))
-            result[force] = {
-                "nominal": float(values[frame]) / body_weight,
-                "frame": frame,
-                "time_s": float(columns["time_s"][frame]),
-                "flexion_deg": float(columns["flexion_deg"][frame]),
-            }
     return result
 
 

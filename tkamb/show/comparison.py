@@ -10,13 +10,13 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, Index
 from tkamb.run import metrics
+from tkamb.run.claims import peaks_of
 from tkamb.run.columns import KINDS
 from tkamb.run.identity import CONTACT_CODE
 from tkamb.run.metrics import failed
 from tkamb.run.results import Results
 from tkamb.run.results_folder import read_results
 from tkamb.show.axis import HorizontalAxis, horizontal_axis
-from tkamb.show.headline import peaks_of
 
 if TYPE_CHECKING:
     from tkamb.run.results import Results
@@ -207,7 +207,7 @@ class Comparison:
                     "contact": run.results.summary.get("contact"),
                     "frames": len(run.results),
                     "failed_frames": int(failed(run.results).sum()),
-                    "peaks_BW": peaks_of(run.results.summary),
+                    "peaks_BW": peaks_of(run.results),
                     "peak_pressure": metrics.peak_pressure(run.results),
                     "paired": _pairing_word(run.pairing),
                 }

@@ -21,7 +21,14 @@ from tkamb.show.pages import asset, policy_sources, render
 from tkamb.show.panels import Panel, centre_panel, panels
 from tkamb.show.plots import WIDTH, Sheet
 from tkamb.show.pressure_maps import draw_maps, draw_paths, mapped_frames, top_view
-from tkamb.show.sections import conclusions, flag_rows, motion_table, strain_table, wear_section
+from tkamb.show.sections import (
+    conclusions,
+    flag_rows,
+    lead,
+    motion_table,
+    strain_table,
+    wear_section,
+)
 from tkamb.show.style import svg_text
 
 if TYPE_CHECKING:
@@ -80,6 +87,7 @@ def report_html(results: "Results", progress: Progress = lambda drawn: drawn) ->
         script=script,
         title=run_title(results.summary),
         subtitle=_subtitle(results),
+        lead=lead(results, axis),
         cards=cards(results, axis),
         conclusions=conclusions(results),
         sentences=_sentences(results.summary),
