@@ -149,7 +149,18 @@ def _export_maps(options: argparse.Namespace) -> int:
 def add_folder_commands(commands: Any) -> None:
     """Add `verify`, `report` and `methods` to the command line."""
     verify = commands.add_parser("verify", help="check that a folder of results is unchanged")
-    verify.add_argument("folder", type=Path, metavar="DIR", help="folder that `tkamb run` wrote")
+    verify.add_argument(
+        "folder", type=Path, metavar="DIR", help="folder that `tkamb run` wrote, or its pack (.zip)"
+    )
+    verify.add_argument(
+        "--inputs",
+        type=Path,
+        metavar="FOLDER",
+        help="folder with a copy of the scene and its files; default: that of the pack or the run",
+    )
+    verify.add_argument(
+        "--rerun", action="store_true", help="compute the run again and compare all columns"
+    )
     verify.set_defaults(command=_verify)
     report = commands.add_parser("report", help="write report.html of a folder of results again")
     report.add_argument("folder", type=Path, metavar="DIR", help="folder that `tkamb run` wrote")
@@ -163,14 +174,20 @@ def add_folder_commands(commands: Any) -> None:
 
 
 def _verify(options: argparse.Namespace) -> int:
-    from tkamb.run.results_folder import verify_results
+    from tkamb.run.reproduction import rerun, unpacked, verify_results
 
-    verdict = verify_results(options.folder)
-    for line in verdict.differs:
+    with unpacked(options.folder) as folder:
+        verdict = verify_results(folder, options.inputs)
+        differs, lines = list(verdict.differs), verdict.lines()[len(verdict.differs) :]
+        if options.rerun and not differs:
+            again = rerun(folder, options.inputs)
+            differs += again.different
+            lines.append(again.line())
+    for line in differs:
         say(f"{options.folder}: {line}")
-    for line in verdict.lines()[len(verdict.differs) :]:
+    for line in lines:
         print(f"{options.folder}: {line}")
-    return 1 if verdict.differs else 0
+    return 1 if differs else 0
 
 
 def _report(options: argparse.Namespace) -> int:

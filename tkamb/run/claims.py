@@ -89,11 +89,10 @@ def split_of(columns: Mapping[str, Any]) -> Split:
 
 def _share(columns: Mapping[str, Any], estimate: str) -> Array:
     """Return medial / (medial + lateral) (f,) of an estimate; NaN without load."""
-    missing = np.full(len(columns["status"]), np.nan)
-    medial, lateral = (
-        np.asarray(columns.get(ESTIMATES[estimate].replace("<side>", side), missing), float)
-        for side in ("medial", "lateral")
-    )
+    names = [ESTIMATES[estimate].replace("<side>", side) for side in FORCES[1:]]
+    if not all(name in columns for name in names):
+        return np.full(len(columns["status"]), np.nan)
+    medial, lateral = (np.asarray(columns[name], float) for name in names)
     unknown = np.isnan(medial) & np.isnan(lateral)
     medial, lateral = np.nan_to_num(medial), np.nan_to_num(lateral)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -6,16 +6,14 @@ import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb import __version__, code_identity
 from tkamb.errors import InputError
 from tkamb.files import (
-    FILE_LIMITS,
     MEGABYTE,
     Replacement,
     read_json,
@@ -24,7 +22,6 @@ from tkamb.files import (
     write_synced,
 )
 from tkamb.io.claim import claimed_directory, settle
-from tkamb.run.identity import CONTACT_CODE, contact_code
 from tkamb.run.results import Results, csv_text, read_bands, read_csv
 from tkamb.run.summary_check import check_summary
 
@@ -216,87 +213,6 @@ def _put_maps(maps: "ContactMaps | None", files: Replacement) -> None:
     from tkamb.run.maps import write_maps
 
     write_maps(maps, files.path(MAPS_NAME))
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """The verification of a results folder.
-
-    Args:
-        differs: messages on changed files.
-        notes: messages on other facts, such as another version of the code.
-        inputs: number of checked input files.
-    """
-
-    differs: tuple[str, ...]
-    notes: tuple[str, ...]
-    inputs: int
-
-    def lines(self) -> list[str]:
-        """Return the messages as lines of text."""
-        end = f"results and {self.inputs} input file(s) have not changed since the run"
-        return [*self.differs, *self.notes, *([] if self.differs else [end])]
-
-
-def verify_results(directory: str | Path) -> Verdict:
-    """Compare a folder with the SHA-256 in its summary.json.
-
-    If writing was interrupted, it is completed first.
-
-    Raises:
-        InputError: it is not a results folder.
-    """
-    directory = Path(directory)
-    settle(directory)
-    summary = read_summary(directory)
-    if not isinstance(summary.get("versions"), Mapping):
-        raise InputError("was not written by tkamb run", directory / SUMMARY_NAME)
-    changes = differences(directory, summary)
-    if not isinstance(summary.get("files"), Mapping):
-        changes.append("has no SHA-256: an earlier tkamb wrote it, so nothing can be checked")
-    try:
-        read_results(directory, check=False)
-    except InputError as error:
-        changes.append(str(error))
-    inputs = summary.get("inputs")
-    inputs = inputs if isinstance(inputs, Mapping) else {}
-    changes += [line for path, recorded in inputs.items() if (line := _input(path, recorded))]
-    return Verdict(tuple(changes), tuple(_notes(summary)), len(inputs))
-
-
-def _input(path: str, recorded: str) -> str | None:
-    """Return a message on an input file; None: it has not changed."""
-    try:
-        same = sha256_of(path, FILE_LIMITS.mesh_bytes) == recorded  # the limit of input files
-    except InputError as error:
-        return f"input {error}"
-    return None if same else f"input {path} has changed since it was read"
-
-
-def _notes(summary: Mapping[str, Any]) -> list[str]:
-    identity = summary.get("identity")
-    identity = identity if isinstance(identity, Mapping) else {}
-    notes, made_by = [], identity.get("version of tkamb")
-    code, this = str(identity.get("code of tkamb")), code_identity()
-    if made_by != __version__ or code != this:
-        notes.append(
-            f"computed by other code (tkamb {made_by}, {code[:12]}; "
-            f"this is {__version__}, {this[:12]})"
-        )
-    contact = summary.get("contact")
-    if CONTACT_CODE in identity and isinstance(contact, Mapping):
-        notes += _plug_in_note(str(contact.get("model")), identity[CONTACT_CODE])
-    if summary.get("unfinished_frames"):
-        notes.append(f"unfinished: {summary['unfinished_frames']} frames are still to be computed")
-    return notes
-
-
-def _plug_in_note(model: str, code: str) -> list[str]:
-    try:
-        same = contact_code(model) == code
-    except InputError as error:
-        return [f"the code of the contact model cannot be compared: {error}"]
-    return [] if same else [f"computed by another code of the contact model '{model}'"]
 
 
 def remove_shards(directory: Path, name: str = FOLDER) -> None:

@@ -28,7 +28,7 @@ from tkamb.run.columns import (
     name_in,
 )
 from tkamb.run.discrepancy import discrepancy_summary
-from tkamb.run.identity import scene_hash
+from tkamb.run.identity import relative_paths, scene_hash
 from tkamb.run.known_errors import as_json, known_error, left_out
 from tkamb.run.read_scene import STRAIN_FLEXIONS
 from tkamb.run.settings import changed_settings
@@ -90,7 +90,10 @@ def summary_of(
     summary["not_modelled"] = not_modelled(case)
     summary["assumptions"] = assumptions(case)
     summary["notes"] = notes_of(scene)
-    summary["scene_tables"] = scene.model_dump(mode="json", exclude_none=True, exclude={"output"})
+    tables = scene.model_dump(exclude_none=True, exclude={"output"})
+    summary["scene_tables"] = relative_paths(
+        tables, None if path is None else path.absolute().parent
+    )
     if changed := changed_settings():
         summary["changed_settings"] = changed
     if strains:
@@ -227,7 +230,7 @@ def _origin(case: Case, path: Path | None) -> dict[str, Any]:
     """Return scene file, overrides, preset, time, command and versions of the run."""
     return {
         "scene": None if path is None else str(path.absolute()),
-        "scene_sha256": scene_hash(case),
+        "scene_sha256": scene_hash(case.scene),
         "overrides": case.scene.overrides,
         "preset": None if case.scene.preset is None else case.scene.preset.as_dict(),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
