@@ -21,10 +21,10 @@ ALWAYS = {
     "--activity --note --muscles --cycle --scale-mass --keep-mass --knee --cutoff-hz",
     "run": "--as --contact --resolution --out --frames --set --no-cache --force --resume "
     "--workers "
-    "--profile --strict --json",
+    "--profile --pack --strict --json",
     "check": "--out --set --json",
     "new": "--side --mass-kg --height-mm --sex",
-    "verify": "",
+    "verify": "--inputs --rerun",
     "methods": "",
     "settings": "--json",
     "live": "--frame --contact --out --port",
