@@ -121,5 +121,5 @@ def test_the_summary_compares_the_nominal_peak_with_the_samples(tmp_path):
     assert peak["samples"] == 20
     assert peak["nominal"] == pytest.approx(np.nanmax(uncertainty.results["force_total_BW"]))
     lines = headline(uncertainty)
-    assert lines[0].startswith("peak total force: ")
+    assert lines[0].startswith("peak forces: total ")
     assert any(line.startswith("peak total force at ") for line in lines)

@@ -196,12 +196,6 @@ class MethodError:
         return float(np.sqrt(np.mean(squares)))
 
     @property
-    def short(self) -> str:
-        """RMS error of the total force and, for trials of the activity, its direction."""
-        words = f"{self.rmse('total'):.2f} BW RMS"
-        return f"{words}, {bias_words(self.trials)}" if self.same_activity else words
-
-    @property
     def sentences(self) -> list[str]:
         """Sentences on the errors, first on an activity without a measurement."""
         return texts.lines("tkamb.run", "error.txt", error=self, groups=self.groups)

@@ -208,14 +208,11 @@ def _legend(results: "Results", axis: HorizontalAxis) -> list[str]:
 
 
 def _sentences(summary: dict[str, Any]) -> list[str]:
-    """Return residuals, notes, assumptions, discrepancy and parts not modelled, each once."""
+    """Return residuals, notes, assumptions and parts not modelled, each once."""
     result: list[str] = []
     for key in ("residuals", "notes", "assumptions"):
         value = summary.get(key) or []
         result.extend([value] if isinstance(value, str) else [str(item) for item in value])
-    words = (summary.get("discrepancy") or {}).get("words")
-    if words and not summary.get("measured"):
-        result.append(str(words))
     missing = summary.get("not_modelled")
     if missing:
         result.append("Not modelled: " + ", ".join(map(str, missing)) + ".")

@@ -69,7 +69,7 @@ def lead(results: "Results", axis: HorizontalAxis) -> list[tuple[str, str]]:
         compared=compared_forces(results.summary),
         at=axis.at,
         kind=axis.kind,
-        wrong=[re.split(r"[:.]", one)[0] for one in unsupported],
+        wrong=[one[:1].lower() + re.split(r"[:.]", one[1:])[0] for one in unsupported],
     )
     return [(head, text) for head, _, text in (line.partition(" | ") for line in words)]
 
