@@ -57,6 +57,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "export": (
         "tkamb export out/my_knee --sto my_knee.sto",
         "tkamb export out/my_knee --vtp --out out/maps",
+        "tkamb export out/my_knee --figures --out figures",
     ),
     "view": (
         "tkamb view out/my_knee",

@@ -24,6 +24,7 @@ from tkamb.run.identity import CONTACT_CODE, contact_code, overrides_of_run, pre
 from tkamb.run.results_folder import (
     CSV_NAME,
     MAPS_NAME,
+    METADATA_NAME,
     REPORT_NAME,
     SUMMARY_NAME,
     UNCERTAINTY_NAMES,
@@ -292,7 +293,7 @@ def pack(directory: str | Path, archive: str | Path) -> int:
         )
     files = [Path(os.path.normpath(folder / name)) for name in summary["inputs"]]
     root = Path(os.path.commonpath([path.parent for path in files]))
-    names = (CSV_NAME, SUMMARY_NAME, MAPS_NAME, REPORT_NAME, *UNCERTAINTY_NAMES)
+    names = (CSV_NAME, METADATA_NAME, SUMMARY_NAME, MAPS_NAME, REPORT_NAME, *UNCERTAINTY_NAMES)
     archive.parent.mkdir(parents=True, exist_ok=True)
     try:
         with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as target:

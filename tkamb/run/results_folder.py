@@ -24,6 +24,7 @@ from tkamb.files import (
 from tkamb.io.claim import claimed_directory, settle
 from tkamb.run.results import Results, csv_text, read_bands, read_csv
 from tkamb.run.summary_check import check_summary
+from tkamb.run.table_metadata import table_metadata
 
 if TYPE_CHECKING:
     from tkamb.run.maps import ContactMaps
@@ -35,6 +36,7 @@ OWN_NAMES = (IDENTITY_NAME, "contact.h5", "*.frame", ".tkamb-*.part")
 """Patterns of the files in `.frames`. No other file is removed from it."""
 CSV_NAME, SUMMARY_NAME, REPORT_NAME = "results.csv", "summary.json", "report.html"
 MAPS_NAME = "contact.h5"
+METADATA_NAME = "results.csv-metadata.json"
 BANDS_NAME, TORNADO_NAME, SAMPLES_NAME = "bands.csv", "tornado.csv", "samples.h5"
 INDICES_NAME = "indices.csv"
 UNCERTAINTY_NAMES = (BANDS_NAME, TORNADO_NAME, SAMPLES_NAME, INDICES_NAME)
@@ -166,6 +168,7 @@ def put_numbers(results: Results, files: Replacement) -> None:
             replacement has none; old files of `UNCERTAINTY_NAMES` are removed.
     """
     write_synced(files.path(CSV_NAME), csv_text(results.columns))
+    write_synced(files.path(METADATA_NAME), table_metadata(results.columns, results.summary))
     recorded = {CSV_NAME: sha256_of(files.path(CSV_NAME))}
     if results.maps is None:
         files.remove(MAPS_NAME)

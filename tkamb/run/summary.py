@@ -252,6 +252,7 @@ def _subject(case: Case) -> dict[str, Any]:
         "yield_stress_MPa": case.scene.yield_stress_MPa,
         "axis": output.axis,
         "activity": output.activity,
+        "licence": output.licence,
     }
 
 
