@@ -46,6 +46,7 @@ def conclusions(results: "Results") -> tuple[list[str], list[str]]:
         known_error=error,
         large=error is not None and is_large(error, PRESSURE_AND_AREA),
         error_words="" if error is None else _known_error(error),
+        foundation=(summary.get("contact") or {}).get("model", "").startswith("foundation"),
         varied=bool(summary.get("uncertainty")),
     )
     return tuple([one[2:] for one in words if one[0] == sign] for sign in "+-")  # type: ignore[return-value]
