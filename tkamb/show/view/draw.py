@@ -174,11 +174,14 @@ def _split_readings(
     """
     split, weight = split_of(results.columns), body_weight(results)
     names = {"equilibrium": "force_equilibrium_N", "deformation": "force_N"}
+    short = {"equilibrium": "equil.", "deformation": "deform."}
     rows = []
     for estimate in sorted(names, key=lambda name: name != split.estimate):
         pair = [
             both(f"· by {estimate}", names[estimate], " BW", 2, 1.0 / weight),
-            number(f"· medial share, {estimate[:6]}.", 100 * medial_share(results, estimate), " %"),
+            number(
+                f"· medial share, {short[estimate]}", 100 * medial_share(results, estimate), " %"
+            ),
         ]
         if estimate == "deformation":
             pair = [replace(row, values=_doubted(row.values, split.undetermined)) for row in pair]
