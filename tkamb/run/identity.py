@@ -85,7 +85,7 @@ def scene_hash(scene: "Scene") -> str:
 
 def scene_content(scene: "Scene") -> Any:
     """Return the scene as JSON types, with the SHA-256 of the content in place of each path."""
-    unused = {"base": True, "output": {"directory"}, "wear": True}
+    unused: dict[str, Any] = {"base": True, "output": {"directory"}, "wear": True}
     unused |= {} if scene.material else {"material": True}
     return _with_content(scene.model_dump(exclude=unused))
 
