@@ -49,7 +49,14 @@ def kill(process):
 def check_complete(out):
     """Check that every visible file in the folder can be read and is complete."""
     names = {path.name for path in out.iterdir() if not path.name.startswith(".")}
-    assert names <= {"results.csv", "summary.json", "contact.h5", "report.html"}
+    known = {
+        "results.csv",
+        "results.csv-metadata.json",
+        "summary.json",
+        "contact.h5",
+        "report.html",
+    }
+    assert names <= known
     if "contact.h5" in names:
         maps = read_maps(out / "contact.h5")
         assert np.isfinite(maps.pressure_Pa).all()

@@ -186,7 +186,7 @@ RULES: dict[str, tuple[Rule, ...]] = {
         Rule("--force", needs=("--html", "--png", "--gif", "--mp4"), because=NO_OUTPUT),
     ),
     "export": (
-        Rule("--out", needs=("--vtp", "--deck"), because="--sto names its own file"),
+        Rule("--out", needs=("--vtp", "--figures", "--deck"), because="--sto names its own file"),
         Rule("--frame", needs=("--deck",)),
         Rule("--resolution", needs=("--deck",)),
         Rule("--force", excludes=("--sto",), because="--sto replaces no file"),

@@ -48,11 +48,11 @@ import numpy as np
 from scipy.special import stdtrit
 
 from tkamb.geometry.frames import Array
+from tkamb.run.claims import FORCES, method_error
 
 DATA = Path(__file__).with_suffix(".json")
 QUANTILE_METHOD: Final = "weibull"
 """Quantile method of NumPy: the p quantile of n samples has rank p (n + 1)."""
-FORCES = ("total", "medial", "lateral")
 COLUMNS = {
     "force_si_N": "total",
     "force_total_N": "total",
@@ -123,8 +123,6 @@ class TrialError:
         inputs: root mean square over the frames of the standard deviation due to the inputs, as a
             share of G.
         correlation_s: time in which the autocorrelation of the error falls to 1/e, s.
-        nominal_rmse_BW: root mean square error of the nominal run, BW.
-        nominal_bias_BW: mean error of the nominal run, predicted minus measured, BW.
     """
 
     trial: str
@@ -137,8 +135,6 @@ class TrialError:
     independent_frames: float
     inputs: float
     correlation_s: float
-    nominal_rmse_BW: float
-    nominal_bias_BW: float
 
 
 @dataclass(frozen=True)
@@ -181,7 +177,6 @@ def trial_error(
     measured: Array,
     nominal: Array,
     load: Array,
-    body_weight: float,
 ) -> TrialError | None:
     """Return the error of a predicted force in a trial; None: too few frames.
 
@@ -192,7 +187,6 @@ def trial_error(
         measured: measured force, N, (f,); NaN in frames without a measurement.
         nominal: force of the nominal run, N, (f,).
         load: load G from `load_of`, N, (f,).
-        body_weight: body weight, N.
     """
     enough = np.isfinite(samples).sum(axis=0) > samples.shape[0] / 2
     compared = enough & np.isfinite(measured) & np.isfinite(nominal)
@@ -201,7 +195,6 @@ def trial_error(
     shares = samples[:, compared] / load[compared]
     error = measured[compared] / load[compared] - np.nanmedian(shares, axis=0)
     rho = _frame_correlation(error - error.mean())
-    nominal_error = (nominal - measured)[compared] / body_weight
     return TrialError(
         *names,
         frames=int(compared.sum()),
@@ -210,8 +203,6 @@ def trial_error(
         independent_frames=float(compared.sum()) * (1.0 - rho**2) / (1.0 + rho**2),
         inputs=float(np.sqrt(np.nanvar(shares, axis=0).mean())),
         correlation_s=-float(np.median(np.diff(time[compared]))) / float(np.log(rho)),
-        nominal_rmse_BW=float(np.sqrt((nominal_error**2).mean())),
-        nominal_bias_BW=float(nominal_error.mean()),
     )
 
 
@@ -329,48 +320,12 @@ def discrepancy_of(summary: Mapping[str, Any]) -> dict[str, Discrepancy]:
 
 
 def discrepancy_summary(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the summary's key `discrepancy`: numbers for each force, and a sentence."""
-    discrepancy = discrepancy_of(summary)
+    """Return the summary's key `discrepancy`: the bands' discrepancy, and the measured error."""
+    error = method_error(summary)
     return {
-        "forces": {force: asdict(one) for force, one in discrepancy.items()},
-        "trials": [one.trial for one in known_errors() if one.force == FORCES[0]],
-        "rmse_BW": rms_error(known_errors(), FORCES[0], summary.get("activity")),
-        "subjects": len({one.subject for one in known_errors()}),
-        "words": discrepancy_words(summary),
+        "forces": {force: asdict(one) for force, one in discrepancy_of(summary).items()},
+        "trials": [one.trial for one in error.trials],
+        "rmse_BW": error.rmse(FORCES[0]),
+        "subjects": len(error.subjects),
+        "words": " ".join(error.sentences),
     }
-
-
-def _of_activity(errors: Sequence[TrialError], activity: str | None) -> Sequence[TrialError]:
-    """Return the trials of an activity; all trials if the activity has none."""
-    return [one for one in errors if one.activity == activity] or errors
-
-
-def rms_error(errors: Sequence[TrialError], force: str, activity: str | None) -> float:
-    """Return the root mean square error of the nominal runs over the trials, BW."""
-    rms = [one.nominal_rmse_BW for one in _of_activity(errors, activity) if one.force == force]
-    return float(np.sqrt(np.mean(np.square(rms))))
-
-
-def discrepancy_words(summary: Mapping[str, Any]) -> str:
-    """Return sentences on the errors of the method against measured knees."""
-    errors, activity = known_errors(), summary.get("activity")
-    compared = _of_activity(errors, activity)
-    of_what = (
-        f"in {activity}" if any(one.activity == activity for one in errors) else "in all activities"
-    )
-    parts = []
-    for force in FORCES:
-        if any(one.force == force for one in compared):
-            parts.append(f"{rms_error(errors, force, activity):.2f} BW ({force})")
-    trials = len({one.trial for one in compared})
-    subjects = len({one.subject for one in compared})
-    words = (
-        f"Against measured knees the RMS error of this method was {', '.join(parts)} {of_what}: "
-        f"{trials} trial{'s' * (trials != 1)}, {subjects} subject{'s' * (subjects != 1)}."
-    )
-    if "muscles" in (summary.get("scene_tables") or {}):
-        return words
-    reason = (
-        "The compared runs had all muscles. This run, without [muscles], may have a larger error."
-    )
-    return f"{words} {reason}"

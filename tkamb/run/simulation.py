@@ -345,7 +345,9 @@ class _Run:
             "frame": "insert: x anterior, y superior, z lateral",
             "model": side.model.name,
             "version": str(self.identity["version of tkamb"]),
-            "scene_sha256": scene_hash(self.case),
+            "scene_sha256": scene_hash(self.case.scene),
+            "licence": self.case.scene.output.licence or "not stated",
+            "creator": f"tkamb {self.identity['version of tkamb']}",
         }
         self.recorder.begin_maps(side.state.points, side.state.triangles, labels)
 

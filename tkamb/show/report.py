@@ -29,7 +29,14 @@ from tkamb.show.pages import asset, policy_sources, render
 from tkamb.show.panels import Panel, centre_panel, panels
 from tkamb.show.plots import WIDTH, Sheet
 from tkamb.show.pressure_maps import draw_maps, draw_paths, mapped_frames, top_view
-from tkamb.show.sections import conclusions, flag_rows, motion_table, strain_table, wear_section
+from tkamb.show.sections import (
+    conclusions,
+    flag_rows,
+    lead,
+    motion_table,
+    strain_table,
+    wear_section,
+)
 from tkamb.show.style import svg_text
 
 if TYPE_CHECKING:
@@ -90,6 +97,7 @@ def report_html(results: "Results", progress: Progress = lambda drawn: drawn) ->
         script=script,
         title=run_title(results.summary),
         subtitle=_subtitle(results),
+        lead=lead(results, axis),
         cards=cards(results, axis),
         conclusions=conclusions(results),
         sentences=_sentences(results.summary),
@@ -218,14 +226,11 @@ def _legend(results: "Results", axis: HorizontalAxis, computed: int) -> list[str
 
 
 def _sentences(summary: dict[str, Any]) -> list[str]:
-    """Return residuals, notes, assumptions, discrepancy and parts not modelled, each once."""
+    """Return residuals, notes, assumptions and parts not modelled, each once."""
     result: list[str] = []
     for key in ("residuals", "notes", "assumptions"):
         value = summary.get(key) or []
         result.extend([value] if isinstance(value, str) else [str(item) for item in value])
-    words = (summary.get("discrepancy") or {}).get("words")
-    if words and not summary.get("measured"):
-        result.append(str(words))
     missing = summary.get("not_modelled")
     if missing:
         result.append("Not modelled: " + ", ".join(map(str, missing)) + ".")

@@ -415,9 +415,8 @@ def _notes(
     request: ImportRequest, scale: float, trial: Trial, own_ligaments: bool
 ) -> tuple[str, ...]:
     quadriceps_note = (
-        "Without [muscles] only the quadriceps acts. When hamstrings and gastrocnemius act too, "
-        "the contact force is too low, and the quadriceps force is the least that the joint moment "
-        "needs."
+        "Without [muscles] only the quadriceps acts: the forces of hamstrings and gastrocnemius "
+        "are missing, and the quadriceps force is the least that the joint moment needs."
     )
     notes = [
         *(() if request.muscles else (quadriceps_note,)),

@@ -394,6 +394,12 @@ class OutputTable(SceneTable):
         None,
         description="the report draws forces that instrumented knees measured in this activity",
     )
+    licence: str | None = Field(
+        None,
+        max_length=200,
+        description="licence of the results, for the metadata of all files: an SPDX expression "
+        "such as CC-BY-4.0, or words",
+    )
     notes: list[str] = Field(default_factory=list, description="printed in the report")
     answers: dict[str, str] = Field(
         default_factory=dict,

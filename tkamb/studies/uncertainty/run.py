@@ -20,9 +20,9 @@ from tkamb.io.claim import claimed_directory
 from tkamb.io.hdf5_file import new_hdf5
 from tkamb.io.scene import Scene, load_scene
 from tkamb.io.scene.case import Case, load_case
+from tkamb.run.claims import peaks
 from tkamb.run.columns import KINDS
 from tkamb.run.guard import interrupt_as_such
-from tkamb.run.recorded import predicted_columns
 from tkamb.run.recorder import Shard, Shards
 from tkamb.run.results import STATISTICS_LIMITS, Results
 from tkamb.run.results_folder import (
@@ -42,7 +42,6 @@ from tkamb.studies.uncertainty.bands import (
     influences,
     measured_inside,
     peak_band,
-    peak_bands,
 )
 from tkamb.studies.uncertainty.inputs import VariedInput, held_inputs, uncertainty_of, varied_inputs
 from tkamb.studies.uncertainty.sample import BandWorker, Sample
@@ -321,9 +320,7 @@ class _Job:
         if PEAK in names:
             peak = peak_band(self.nominal[PEAK], values[:, names.index(PEAK)], failed)
             summary["uncertainty"]["peak_force_total_BW"] = peak
-        summary["uncertainty"]["peaks_BW"] = peak_bands(
-            self.nominal.columns, bands, predicted_columns(self.nominal.columns), weight
-        )
+        summary["uncertainty"]["peaks_BW"] = peaks(self.nominal.columns, bands, weight)
         if summary.get("measured"):
             inside = measured_inside(self.nominal.columns, bands, summary["measured"])
             summary["uncertainty"]["measured_inside"] = inside
