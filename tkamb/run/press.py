@@ -33,7 +33,7 @@ from tkamb.io.given_material import (
     material_in_words,
     named_material,
 )
-from tkamb.io.recordings.meshes import axes_rotation, load_surface, mirrored
+from tkamb.io.recordings.meshes import axes_rotation, check_same_space, load_surface, mirrored
 from tkamb.knee.adjustment import press_adjusted
 from tkamb.run.known_errors import KnownError, as_json, known_error, known_error_words, left_out
 from tkamb.units import DEGREE, LENGTH, MEGAPASCAL, MILLIMETRE
@@ -401,6 +401,8 @@ def load_pair(
     """Return femoral component, insert and pose_femoral_in_insert (4, 4); see `press_meshes`."""
     rotation = axes_rotation(axes)
     femoral_pose = mesh_pose(pose, units, rotation)
+    if Path(femoral).is_file() and Path(insert).is_file():  # `load_surface` names a missing file
+        check_same_space(femoral, insert)
     femoral_surface = load_surface(femoral, units, axes, name="femoral")
     insert_surface = load_surface(insert, units, axes, name="insert", closed=True)
     if side == "left":
