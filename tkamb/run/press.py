@@ -35,7 +35,14 @@ from tkamb.io.given_material import (
 )
 from tkamb.io.recordings.meshes import axes_rotation, check_same_space, load_surface, mirrored
 from tkamb.knee.adjustment import press_adjusted
-from tkamb.run.known_errors import KnownError, as_json, known_error, known_error_words, left_out
+from tkamb.run.known_errors import (
+    KnownError,
+    as_json,
+    known_error,
+    known_error_words,
+    left_out,
+    outside_measured,
+)
 from tkamb.units import DEGREE, LENGTH, MEGAPASCAL, MILLIMETRE
 
 
@@ -340,7 +347,9 @@ def press_meshes(
         prepare_seconds=prepared - started,
         solve_seconds=solved - prepared,
         peak_rss_MB=peak_rss(),
-        known_error=known_error(contact, resolution_mm, pair.material.name, options),
+        known_error=None
+        if outside_measured(result.flags)
+        else known_error(contact, resolution_mm, pair.material.name, options),
     )
 
 
