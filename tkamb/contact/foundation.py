@@ -5,7 +5,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from tkamb.contact.flags import narrow_flags
+from tkamb.contact.flags import narrow_flags, unsupported_flags
 from tkamb.contact.materials import Material
 from tkamb.contact.model import CondyleWrench, ContactModel, ProbedContact
 from tkamb.contact.pressing import PRESS, press_by_search
@@ -118,10 +118,12 @@ class ElasticFoundation(ContactModel):
             return ContactResult.failed(state, pose, TOO_DEEP if full_depth else OVER_THE_EDGE)
         pressure = layer_pressure(self.law, state.pair.material, strain)
         medial = medial_points(samples.points, pose, state.pair.split)
-        flags = narrow_flags(
-            samples.triangles, pressure > 0, {"medial": medial, "lateral": ~medial}, "columns"
+        sides = {"medial": medial, "lateral": ~medial}
+        flags = (
+            *unsupported_flags(state.pair.insert, samples.points, pressure, sides),
+            *narrow_flags(samples.triangles, pressure > 0, sides, "columns"),
         )
-        return ContactResult.of(state, pose, pressure, gap, medial=medial, flags=tuple(flags))
+        return ContactResult.of(state, pose, pressure, gap, medial=medial, flags=flags)
 
     def press(
         self, state: SampledContact, load: float, pose: Array, guess: Guess | None = None
