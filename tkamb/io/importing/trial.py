@@ -35,6 +35,7 @@ from tkamb.io.recordings.inverse_kinematics import LegChain
 from tkamb.io.recordings.marker_motion import both_fits, leg_segments, neutral_coordinates
 from tkamb.io.recordings.markers import matched_labels, plain_label
 from tkamb.io.recordings.recording_tables import MarkersTable
+from tkamb.io.recordings.samples import check_spacing
 from tkamb.io.recordings.tables import Table, read_table, with_unit
 from tkamb.io.scene import Scene
 
@@ -166,6 +167,7 @@ def from_markers(request: ImportRequest, leg: Leg, links: Links, recorded: Table
     foot_positions = marked_feet(recorded, facing.axes, feet(leg, recorded, OTHER[leg.side]))
     result = find_ground(request, leg.side, facing.axes, foot_positions)
     time = recorded.time()
+    check_spacing(recorded.path, time)
     if request.interval is not None:
         _check_within(time, *request.interval)
     interval, joined = common_interval(time, result.interval, result.span)
@@ -226,11 +228,22 @@ def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: T
     if motion.missing:
         text.append(f"not in the motion, so at their defaults: {', '.join(motion.missing)}")
     text += [*_notices(request, recorded), *motion.remarks]
+    leg.model.check_gravity()
     feet = model_feet(links, recorded) if request.grf is not None else None
-    result = find_ground(request, leg.side, "+x,+y,+z", feet)
+    axes = leg.model.ground_axes
+    if axes is None:
+        if request.grf is not None:
+            raise InputError(
+                "has gravity along none of its ground's axes, so forces in this ground cannot be "
+                "read",
+                request.model,
+                "turn ground so that gravity is along an axis, or leave out --grf",
+            )
+        axes = "+x,+y,+z"
+    result = find_ground(request, leg.side, axes, feet)
     text += result.remarks
     if result.ground is not None:
-        text.append("laboratory: the model's ground, x forward, y up")
+        text.append(f"laboratory: forward, up, right are {axes} of the model's ground")
     if request.interval is not None:
         _check_within(motion.time, *request.interval)
     interval, joined = common_interval(motion.time, result.interval, result.span)

@@ -35,6 +35,7 @@ from tkamb.io.recordings.inverse_kinematics import (
 from tkamb.io.recordings.laboratory import laboratory_rotation
 from tkamb.io.recordings.markers import MARKER_FIT, fit_seen, marker_trajectories
 from tkamb.io.recordings.recording_tables import MarkersTable, MotionTable, Side
+from tkamb.io.recordings.samples import check_spacing
 from tkamb.io.recordings.tables import Table, read_table
 from tkamb.io.recordings.tibia import BodyMotion
 from tkamb.units import DEGREE, MILLIMETRE
@@ -111,6 +112,7 @@ def load_marker_motion(
     assert source.markers is not None
     recorded = read_table(source.file, source.format)
     time = recorded.time()
+    check_spacing(recorded.path, time)
     segments, measured = leg_segments(source.markers, recorded, source.length_unit, side)
     neutral = neutral_coordinates(source.markers, side)
     chain = LegChain(segments, pose_insert_in_tibia, source.markers.knee == "free")
