@@ -92,6 +92,77 @@ def test_quoted_cells_of_a_csv_are_read(tmp_path):
     np.testing.assert_array_equal(read_table(tmp_path / "a.csv").column("x"), [1.5, 2.0])
 
 
+LABELS = "Frame#\tTime\tR.Heel\t\t\tR.Toe\t\t"
+
+
+def as_spreadsheet(line, separator):
+    """Return a line with another separator, padded to the width of the table."""
+    return separator.join((line.split("\t") + [""] * 8)[:8])
+
+
+@pytest.mark.parametrize("separator", [",", ";"])
+@pytest.mark.parametrize("quoted", [False, True])
+def test_tables_that_a_spreadsheet_saved_with_other_separators_are_read(
+    tmp_path, separator, quoted
+):
+    plain = trc(tmp_path, LABELS)
+    lines = (tmp_path / "a.trc").read_text().splitlines()
+    lines = [as_spreadsheet(line, separator) for line in lines]
+    if quoted:
+        lines = [separator.join(f'"{cell}"' for cell in line.split(separator)) for line in lines]
+    (tmp_path / "a.trc").write_text("\n".join(lines), encoding="utf-8")
+    table = read_table(tmp_path / "a.trc")
+    word = {",": "commas", ";": "semicolons"}[separator]
+    assert len(table.notices) == 1 + quoted and f"has {word} between" in table.notices[-1]
+    assert table.length_unit == "mm" and table.columns.keys() == plain.columns.keys()
+    for name, values in plain.columns.items():
+        np.testing.assert_array_equal(table.column(name), values)
+    text = (STORAGE.format(rows=2, degrees="no", more="") + "time\tknee\n0\t1\n0.1\t2\n").split(
+        "\n"
+    )
+    (tmp_path / "a.mot").write_text("\n".join(as_spreadsheet(t, separator)[:-6] for t in text))
+    table = read_table(tmp_path / "a.mot")
+    assert table.in_degrees is False and len(table.notices) == 1
+    np.testing.assert_array_equal(table.column("knee"), [1.0, 2.0])
+
+
+@pytest.mark.parametrize("part", ["all", "header", "names", "rows"])
+def test_quotes_and_tabs_around_the_cells_of_a_storage_file_are_left_out(tmp_path, part):
+    rows = {"header": (0, 5), "names": (5, 6), "rows": (6, 8), "all": (0, 8)}[part]
+    lines = (STORAGE.format(rows=2, degrees="no", more="") + "time\tknee\n0\t1\n0.1\t2").split("\n")
+    assert lines[4] == "endheader" and len(lines) == 8
+    for k in range(*rows):
+        lines[k] = "\t".join(f'"{cell}"' for cell in lines[k].split("\t")) + "\t\t"
+    (tmp_path / "a.mot").write_text("\n".join(lines), encoding="utf-8")
+    table = read_table(tmp_path / "a.mot")
+    assert table.in_degrees is False and "has quotes around" in table.notices[0]
+    np.testing.assert_array_equal(table.column("knee"), [1.0, 2.0])
+
+
+@pytest.mark.parametrize("where", ["all", "rows", "labels"])
+def test_a_tab_before_each_row_of_a_trc_is_left_out(tmp_path, where):
+    plain = trc(tmp_path, LABELS)
+    labels = LABELS if where == "rows" else "\t" + LABELS
+    rows = ROWS if where == "labels" else ["\t" + row for row in ROWS]
+    counts = "\t" + COUNTS if where == "all" else COUNTS
+    table = trc(tmp_path, labels, rows=rows, counts=counts)
+    assert len(table.notices) == (where != "labels")
+    for name, values in plain.columns.items():
+        np.testing.assert_array_equal(table.column(name), values)
+    unnumbered = trc(tmp_path, LABELS, rows=[row[1:] for row in ROWS])  # the frames lack numbers
+    np.testing.assert_array_equal(unnumbered.column("R.Heel_x"), plain.column("R.Heel_x"))
+
+
+def test_decimal_commas_are_no_separators(tmp_path):
+    for rows in (
+        ["1\t0,00\t1\t2\t3\t4\t5\t6"],
+        [";".join(["1", "0,00", "1", "2", "3", "4", "5", "6"])],
+    ):
+        labels = LABELS.replace("\t", ";") if ";" in rows[0] else LABELS
+        with pytest.raises(InputError, match="a decimal point, not a comma"):
+            trc(tmp_path, labels, rows=rows)
+
+
 def test_labels_with_blanks_in_them_between_tabs_or_many_blanks(tmp_path):
     for labels in ("Frame#\tTime\tR heel\t\t\tR toe\t\t", "Frame#   Time   R heel    R toe"):
         np.testing.assert_array_equal(trc(tmp_path, labels).column("R heel_y"), 2.0)
