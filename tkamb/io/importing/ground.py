@@ -13,6 +13,7 @@ from tkamb.io.importing.plates import (
     Load,
     RecordedForce,
     TableForce,
+    check_upward,
     common_surface,
     feet_loads,
     known_interval,
@@ -107,10 +108,11 @@ def _from_plates(request: ImportRequest, side: str, axes: str, feet: Feet) -> Fo
             "give the ground reaction with --grf, or --plates none to model none",
         )
     forces = plate_forces(recording, axes)
+    downward = check_upward(forces, feet, side)
     loads = feet_loads(forces, feet)
     plates = own_plates(loads, side, request.recording)
     interval = request.interval or known_interval(loads, plates, feet)
-    lines = [*(_load_line(load) for load in loads), _interval_line(request, interval)]
+    lines = [*(_load_line(load) for load in loads), *downward, _interval_line(request, interval)]
     lines += _unmeasured_line(loads, plates, feet, side, interval)
     lines += _drift_lines(forces, plates)
     surface = common_surface(loads, plates)
