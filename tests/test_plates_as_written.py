@@ -250,7 +250,7 @@ def test_nan_samples_are_refused_only_between_the_frames(tmp_path, where):
     np.testing.assert_allclose(
         ground.force[:, 1], np.interp(frames, time, pushes()[0][:, 2]), atol=0.05
     )
-    assert "not numbers" in ground.notices[0]
+    assert "a.c3d: used from" in ground.remarks[0] and "not numbers" in ground.remarks[0]
 
 
 def mistaken(folder, kind, factor, **more):

@@ -208,6 +208,7 @@ SUMMARY = optional(
         "notes": TEXTS,
         "residuals": "text",
         "questions": TEXTS,
+        "remarks": TEXTS,
         "scene_tables": TABLES,
         "changed_settings": {ANY_KEY: "any"},
         "measures": {

@@ -84,6 +84,7 @@ def cards(results: "Results", axis: HorizontalAxis) -> list[Card]:
     """Return the headline numbers that the run has."""
     result = (
         _questions(results),
+        _remarks(results),
         _peaks(results),
         _peak_force(results, axis),
         _band(results, axis),
@@ -115,6 +116,13 @@ def _questions(results: "Results") -> Card | None:
     many = len(questions) > 1
     detail = " ".join(f"({k}) {q}" if many else str(q) for k, q in enumerate(questions, 1))
     return Card("Questions to answer", str(len(questions)), detail, True)
+
+
+def _remarks(results: "Results") -> Card | None:
+    remarks = results.summary.get("remarks") or []
+    if not remarks:
+        return None
+    return Card("Notices on recordings", str(len(remarks)), "; ".join(map(str, remarks)))
 
 
 def peak_words(peak: Mapping[str, Any]) -> str:

@@ -133,7 +133,7 @@ def _from_table(
     forces = table_forces(table)
     time = table.time()
     span = (float(time[0]), float(time[-1]))
-    notices = [f"notice: {path.name}: {notice}" for notice in table.notices]
+    notices = [f"notice: {remark}" for remark in table.remarks]
     table_axes = _axes_of_table(table, forces, axes)
     if table_axes != axes:
         notices.append(f"{path.name}: y points up; forward, up, right are its {table_axes}")

@@ -74,7 +74,7 @@ def with_static_markers(
         f"marker positions are from the standing trial {static.name}, at most "
         f"{farthest * 1e3:.1f} mm from the model's"
     )
-    notices = [f"notice: {static.name}: {notice}" for notice in recorded.notices]
+    notices = [f"notice: {remark}" for remark in recorded.remarks]
     return replace(scene, markers=markers), [line, *notices]
 
 
@@ -254,10 +254,10 @@ def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: T
 
 def _notices(request: ImportRequest, recorded: Table) -> list[str]:
     """Return notes on parts of the recording that are ignored or read in another way."""
-    notices = recorded.notices
+    remarks = recorded.remarks
     if recorded.path.suffix.lower() == ".c3d":
-        notices = read_c3d(recorded.path, request.units).all_notices
-    return [f"notice: {recorded.path.name}: {notice}" for notice in notices]
+        remarks = read_c3d(recorded.path, request.units).remarks
+    return [f"notice: {remark}" for remark in remarks]
 
 
 def _facing(request: ImportRequest, segments: list[ModelSegment], recorded: Table) -> Facing:

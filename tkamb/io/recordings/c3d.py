@@ -109,6 +109,11 @@ class Recording:
         unread = [f"not used: {', '.join(names)}: {what}" for what, names in parts.items()]
         return (*self.notices, *plate_notices, *unread)
 
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """All notices, each with the name of the file."""
+        return tuple(f"{self.path.name}: {notice}" for notice in self.all_notices)
+
     def plate(self, number: int) -> ForcePlate:
         """Return a plate by its number.
 

@@ -71,6 +71,7 @@ class MarkerKinematics:
         centre_distance: (n,) m, distance between the knee centres by the separate fits of shank
             and thigh.
         missing: (n,) number of missing markers of shank and thigh.
+        remarks: notices on the file.
     """
 
     time: Array
@@ -81,6 +82,7 @@ class MarkerKinematics:
     rms: dict[Method, Array]
     centre_distance: Array
     missing: np.ndarray
+    remarks: tuple[str, ...] = ()
 
     def at(self, values: Array, time: Array) -> Array:
         """Return values (n,) of the frames at other times, s, by linear interpolation."""
@@ -92,7 +94,7 @@ class MarkerKinematics:
             self.time, self.tibia, cutoff_Hz, time, name
         )
         residual = self.at(self.rms[self.method], time)
-        return BodyMotion(time, filtered, velocity, acceleration, residual)
+        return BodyMotion(time, filtered, velocity, acceleration, residual, remarks=self.remarks)
 
 
 def load_marker_motion(
@@ -262,6 +264,7 @@ def _compare_readings(
         {name: values[run] for name, values in rms.items()},
         np.linalg.norm(knees["segments"][run, :3] - neutral[:3], axis=1),
         missing.sum(axis=1)[run],
+        recorded.remarks,
     )
 
 

@@ -68,6 +68,11 @@ class Table:
     unit_word: str = ""
 
     @property
+    def remarks(self) -> tuple[str, ...]:
+        """The notices, each with the name of the file."""
+        return tuple(f"{self.path.name}: {notice}" for notice in self.notices)
+
+    @property
     def rows(self) -> int:
         """Number of data rows."""
         return len(next(iter(self.columns.values())))
