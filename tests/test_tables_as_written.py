@@ -348,6 +348,61 @@ def test_several_forces_under_one_foot_are_summed(tmp_path):
     np.testing.assert_allclose(summed.ground.moment, case.ground.moment, atol=1e-5)
 
 
+def external_loads(tmp_path, body="foot_r", number=2, root=True, frame="ground", datafile="g.mot"):
+    """Write a list of external loads: one force on the foot, and one on another body."""
+    entries = "".join(
+        f'<ExternalForce name="F{k}"><applied_to_body>{b}</applied_to_body>'
+        f"<force_expressed_in_body>{frame}</force_expressed_in_body>"
+        f"<force_identifier>ground_force_{k}_v</force_identifier>"
+        f"<point_identifier>ground_force_{k}_p</point_identifier>"
+        f"<torque_identifier>ground_moment_{k}_m</torque_identifier></ExternalForce>"
+        for k, b in ((3 - number, "pelvis"), (number, body))
+    )
+    text = f"<objects>{entries}</objects><datafile>{datafile}</datafile>"
+    text = f'<ExternalLoads name="x">{text}</ExternalLoads>'
+    if root:
+        text = f'<?xml version="1.0"?><OpenSimDocument Version="40000">{text}</OpenSimDocument>'
+    (tmp_path / "loads.xml").write_text(text)
+    return str(tmp_path / "loads.xml")
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"root": False}, {"body": "/bodyset/foot_r"}, {"frame": "/ground"}]
+)
+def test_a_list_of_external_loads_says_which_force_is_the_foots(tmp_path, options):
+    arguments = recorded_leg(tmp_path)
+    table = two_forces(tmp_path)
+    assert main(changed(arguments, grf=table, grf_force="ground_force_2")) == 0
+    listed = changed(arguments, grf=external_loads(tmp_path, **options), out=str(tmp_path / "x"))
+    assert main(listed) == 0
+    cases = [load_case(load_scene(tmp_path / name / "scene.toml")) for name in ("out", "x")]
+    for part in ("force", "point", "moment"):
+        np.testing.assert_array_equal(*(getattr(case.ground, part) for case in cases))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"body": "tibia_r"}, "applies no force to the foot .foot_r., but to pelvis, tibia_r"),
+        ({"frame": "foot_r"}, "in the frame 'foot_r', which is not read"),
+        ({"datafile": "h.mot"}, "h.mot"),
+        ({"number": 1}, ""),
+        ({"number": 5}, "names columns 'ground_force_5_v…'"),
+    ],
+)
+def test_a_list_of_external_loads_that_names_no_force_of_the_foot_is_refused(
+    tmp_path, capsys, options, words
+):
+    arguments = recorded_leg(tmp_path)
+    two_forces(tmp_path)
+    status = main(changed(arguments, grf=external_loads(tmp_path, **options)))
+    error = capsys.readouterr().err
+    if options == {"number": 1}:  # the force is a metre beside the foot
+        assert status == 2 and "from the ankle" in error
+        return
+    assert status == 2 and words.replace(".foot_r.", "(foot_r)") in error
+
+
 @pytest.mark.parametrize("span", [(0.0009, 0.99), (0.1, 0.8), (-0.3, 0.7)])
 def test_only_the_common_time_of_motion_and_force_is_used(tmp_path, capsys, span):
     arguments = recorded_leg(tmp_path)

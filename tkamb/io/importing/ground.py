@@ -8,6 +8,8 @@ import numpy as np
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
+from tkamb.io.importing.anatomy import Leg
+from tkamb.io.importing.external_loads import with_external_loads
 from tkamb.io.importing.plates import (
     Feet,
     Load,
@@ -68,18 +70,19 @@ class FoundGround:
     remarks: list[str]
 
 
-def find_ground(request: ImportRequest, side: str, axes: str, feet: Feet | None) -> FoundGround:
+def find_ground(request: ImportRequest, leg: Leg, axes: str, feet: Feet | None) -> FoundGround:
     """Return the ground reaction of one foot.
 
     Args:
         request: the recording, table, plates and interval.
-        side: "left" or "right".
+        leg: the leg of the foot.
         axes: axes of the recording and table that point forward, up and right.
         feet: positions of the feet; None: unknown.
 
     Raises:
         InputError: the plates or columns cannot be used, or both feet loaded one plate.
     """
+    request, side = with_external_loads(request, leg.foot), leg.side
     if request.grf is not None:
         return _from_table(request, request.grf, side, axes, feet)
     if request.recording.suffix.lower() == ".c3d" and feet is not None:

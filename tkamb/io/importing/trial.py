@@ -165,7 +165,7 @@ def from_markers(request: ImportRequest, leg: Leg, links: Links, recorded: Table
     segments = model_segments(links, recorded, request.without)
     facing = _facing(request, segments, recorded)
     foot_positions = marked_feet(recorded, facing.axes, feet(leg, recorded, OTHER[leg.side]))
-    result = find_ground(request, leg.side, facing.axes, foot_positions)
+    result = find_ground(request, leg, facing.axes, foot_positions)
     time = recorded.time()
     check_spacing(recorded.path, time)
     if request.interval is not None:
@@ -202,7 +202,7 @@ def from_poses(
     shank = shank_markers(links, segments, stance, request.recording, facing.axes)
     covered = replace(request, interval=(float(poses.time[0]), float(poses.time[-1])))
     foot_positions = marked_feet(recorded, facing.axes, feet(leg, recorded, OTHER[leg.side]))
-    result = find_ground(covered, leg.side, facing.axes, foot_positions)
+    result = find_ground(covered, leg, facing.axes, foot_positions)
     matched = [*_notices(request, recorded), *_segment_lines(segments.values(), request.without)]
     text = (
         *poses.remarks,
@@ -240,7 +240,7 @@ def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: T
                 "turn ground so that gravity is along an axis, or leave out --grf",
             )
         axes = "+x,+y,+z"
-    result = find_ground(request, leg.side, axes, feet)
+    result = find_ground(request, leg, axes, feet)
     text += result.remarks
     if result.ground is not None:
         text.append(f"laboratory: forward, up, right are {axes} of the model's ground")
