@@ -420,6 +420,45 @@ def test_only_the_common_time_of_motion_and_force_is_used(tmp_path, capsys, span
     assert time[0] >= span[0] and time[-1] <= span[1] and np.ptp(time) > 0.5
 
 
+def walking_leg(tmp_path):
+    """Write a leg that stands from 0.4 to 0.7 s between two steps; return its import and foot."""
+    arguments = recorded_leg(tmp_path)
+    table = read_table(tmp_path / "leg.trc")
+    time = np.arange(60) / 60.0
+    forward = np.interp(time, [0.2, 0.4, 0.7, 0.9], [0.0, 0.7, 0.7, 1.4])
+    labels = [name[:-2] for name in table.columns if name.endswith("_x")]
+    markers = {
+        name: np.stack([table.columns[f"{name}_{axis}"] for axis in "xyz"], axis=1)
+        * table.unit_scale(None, "")
+        + np.outer(forward, [1.0, 0.0, 0.0])
+        for name in labels
+    }
+    write_trc(tmp_path / "leg.trc", time, markers, 60.0)
+    return arguments, time, np.mean([markers[n] for n in labels if "foot_r" in n], axis=0)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.02, 0.25, -0.2, 0.4])
+@pytest.mark.parametrize("named", [True, False])
+def test_force_and_motion_on_two_clocks_are_refused_with_the_shift(tmp_path, capsys, shift, named):
+    """The foot is loaded while it stands; the force's clock is late by `shift`."""
+    arguments, time, foot = walking_leg(tmp_path)
+    columns, stands = {"time": time + shift}, (time >= 0.4) & (time <= 0.7)
+    for k, axis in enumerate("xyz"):
+        columns[f"ground_force_1_v{axis}"] = np.where(stands, [10.0, 400.0, 5.0][k], 0.0)
+        columns[f"ground_force_1_p{axis}"] = foot[:, k] * (k != 1)
+        columns[f"ground_force_2_v{axis}"] = np.where(stands, [10.0, 300.0, 5.0][k], 0.0)
+        columns[f"ground_force_2_p{axis}"] = foot[:, k] * (k != 1) + (k == 2)
+    write_storage(tmp_path / "g.mot", columns, in_degrees=False)
+    options = {"grf_force": "ground_force_1"} if named else {}
+    status = main(changed(arguments, grf=str(tmp_path / "g.mot"), **options))
+    error = capsys.readouterr().err
+    if abs(shift) < 0.1:
+        assert status == 0, error
+        return
+    assert status == 2 and "force and motion are on two clocks" in error
+    assert f"{-shift:+.3f} s is added" in error and "write the times of leg.trc into it" in error
+
+
 def test_files_without_a_common_time_are_refused(tmp_path, capsys):
     path = two_forces(tmp_path, span=(5.0, 6.0))
     arguments = changed(recorded_leg(tmp_path), grf=path, grf_force="ground_force_2")

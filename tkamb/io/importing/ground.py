@@ -9,6 +9,7 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.io.importing.anatomy import Leg
+from tkamb.io.importing.clocks import check_clocks
 from tkamb.io.importing.external_loads import with_external_loads
 from tkamb.io.importing.plates import (
     Feet,
@@ -144,21 +145,27 @@ def _from_table(
     if request.plates is not None:
         raise InputError("is for the plates of a .c3d", "--plates", "give --grf-force for a table")
     chosen = _named(forces, side, request.grf_force, table)
+    has_places = all(force.has("point") or force.has("moment") for force in forces)
     if chosen:
+        if feet is not None and has_places:
+            check_clocks([_recorded(table, force, axes) for force in chosen], feet, side, path)
         why = "as given" if request.grf_force else "by their name"
         recorded = [_recorded(table, force, axes) for force in chosen] if len(chosen) > 1 else []
         ground = _table_file(path, axes, chosen, recorded)
         lines = [_columns_line(path, side, chosen, why), *notices]
         return FoundGround(ground, request.interval, span, lines)
-    has_places = all(force.has("point") or force.has("moment") for force in forces)
     if feet is None or not forces or not has_places:
         raise _which_foot(forces, side, table)
     recorded = [_recorded(table, force, axes) for force in forces]
     loads = feet_loads(recorded, feet)
+    if not any(load.side == side for load in loads):
+        for one in recorded:
+            check_clocks([one], feet, side, path)
     names = own_plates(loads, side, path, "give --grf-force")
     interval = request.interval or known_interval(loads, names, feet)
     chosen = [force for force in forces if force.name in names]
     foot_forces = [force for force in recorded if force.key in names]
+    check_clocks(foot_forces, feet, side, path)
     lines = [*(_load_line(load) for load in loads), _interval_line(request, interval)]
     lines += [_columns_line(path, side, chosen, "by their points of application"), *notices]
     lines += [*_unmeasured_line(loads, names, feet, side, interval), *_drift_lines(recorded, names)]

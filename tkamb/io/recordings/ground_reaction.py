@@ -327,7 +327,8 @@ def check_under_foot(ground: GroundReaction, ankle: Array, path: Path) -> None:
         raise InputError(
             f"the centre of pressure lies up to {farthest:.3g} m from the ankle",
             path,
-            "check [ground_reaction] length_unit, columns and laboratory_axes, and [tibia]",
+            "check [ground_reaction] length_unit, columns and laboratory_axes, [tibia], and the "
+            "clocks of both files",
         )
 
 
