@@ -177,6 +177,8 @@ def _run(options: argparse.Namespace) -> int:
     failed = [k for k, status in enumerate(results.status) if status.startswith(FAILED)]
     for k in failed:
         say(f"frame {k}: {results.status[k]}")
+    for remark in results.summary.get("remarks", []):
+        say(f"notice: {remark}")
     for question in results.summary.get("questions", []):
         say(f"question: {question}")
     if options.json:

@@ -10,6 +10,7 @@ killed later, the next command that writes into the folder finishes the renames
 (`finish_replacement`). Readers change nothing.
 """
 
+import codecs
 import csv
 import hashlib
 import json
@@ -50,6 +51,12 @@ class FileLimitSettings:
 
 FILE_LIMITS = FileLimitSettings()
 
+BYTE_ORDER_MARKS = {
+    codecs.BOM_UTF8: "utf-8-sig",
+    codecs.BOM_UTF16_LE: "utf-16",
+    codecs.BOM_UTF16_BE: "utf-16",
+}
+"""First bytes of a text file -> its encoding. Editors of Windows write them."""
 
 SAVE_AS_UTF8 = "save it as UTF-8 text"
 
@@ -123,11 +130,16 @@ def read_text(
 ) -> str:
     """Return the content of a regular text file, with line ends as `\\n`.
 
+    A byte order mark at its beginning decides the encoding.
+
     Raises:
         InputError: as `read_bytes`, or the content is not text in this encoding.
     """
+    content = read_bytes(path, limit, what=what)
+    for mark, marked in BYTE_ORDER_MARKS.items():
+        encoding = marked if content.startswith(mark) else encoding
     try:
-        text = read_bytes(path, limit, what=what).decode(encoding)
+        text = content.decode(encoding)
     except UnicodeDecodeError as error:
         raise InputError(f"cannot be read ({error})", path) from None
     return text.replace("\r\n", "\n").replace("\r", "\n")

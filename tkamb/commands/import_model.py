@@ -66,7 +66,10 @@ def add_import(commands: Any) -> None:
         "--motion", type=Path, metavar="F", help="motion file of the model's coordinates"
     )
     command.add_argument(
-        "--grf", type=Path, metavar="F", help=".mot or .sto of the ground reactions"
+        "--grf",
+        type=Path,
+        metavar="F",
+        help=".mot or .sto of the ground reactions, or OpenSim's list of external loads (.xml)",
     )
     command.add_argument(
         "--grf-force",

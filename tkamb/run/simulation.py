@@ -319,6 +319,7 @@ class _Run:
         if muscles is not None:
             summary["muscle_groups"] = muscles.groups
         plausibility = self.solver.plausibility
+        summary["remarks"] = list(self.case.remarks)
         summary["questions"] = [question.text for question in plausibility.questions]
         summary["notes"] += plausibility.answered
         summary["identity"] = self.identity

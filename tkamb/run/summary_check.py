@@ -251,6 +251,7 @@ class Summary(TypedDict, total=False):
     notes: Texts | None
     residuals: str | None
     questions: Texts | None
+    remarks: Texts | None
     scene_tables: Tables | None
     changed_settings: Words | None
     measures: Measures | None

@@ -111,6 +111,7 @@ def _facts(results: "Results") -> dict[str, Any]:
     summary = results.summary
     return {
         "questions": summary.get("questions") or [],
+        "remarks": summary.get("remarks") or [],
         "peaks": claims.peaks_of(results),
         "split": claims.split_of(results.columns),
         "error": claims.method_error(summary),

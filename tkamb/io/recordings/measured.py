@@ -48,11 +48,13 @@ class MeasuredForce:
         path: the file.
         time: (n,) s, on the clock of the motion.
         force: "total", "medial" or "lateral", if known -> (n,) N, gaps NaN.
+        remarks: notices on the file.
     """
 
     path: Path
     time: Array
     force: dict[str, Array]
+    remarks: tuple[str, ...] = ()
 
     def at(self, time: Array) -> dict[str, Array]:
         """Return the forces (f,) N at times (f,) s, by linear interpolation.
@@ -92,7 +94,7 @@ def load_measured_force(source: MeasuredTable, time: Array) -> MeasuredForce:
         if role != "time"
     }
     check_overlap(source.file, clock, time, "[measured]")
-    return MeasuredForce(source.file, clock, _with_third(force))
+    return MeasuredForce(source.file, clock, _with_third(force), table.remarks)
 
 
 def _sum(table: Table, column: str | dict[str, float]) -> Array:

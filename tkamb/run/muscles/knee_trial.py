@@ -262,9 +262,11 @@ def _read_leg(path: Path, side: Side) -> Leg:
     """Return a leg of a model.
 
     Raises:
-        InputError: a joint or constraint of the model, or a muscle of the leg, cannot be read.
+        InputError: the model has no gravity, or a joint or constraint of the model, or a muscle of
+            the leg, cannot be read.
     """
     leg = find_leg(read_osim(path, partial=True), side)
+    leg.model.check_gravity()
     bodies = {body for group in leg_bones(leg).values() for body in group}
     for one in leg.model.unread:
         if one.constrains or (one.concerns & bodies and one.kind != "Marker"):
