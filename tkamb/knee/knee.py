@@ -21,7 +21,7 @@ from tkamb.geometry.frames import (
     Array,
     knee_pose,
 )
-from tkamb.knee.assembled import PATELLAR_LIGAMENT, AssembledKnee, KneeData
+from tkamb.knee.assembled import AssembledKnee, KneeData
 from tkamb.knee.canonical import KneePose, mirrored_spatial, summed
 from tkamb.knee.contact_points import NO_CONTACT
 from tkamb.knee.equations import KneeGeometry
@@ -130,7 +130,7 @@ class Knee(AssembledKnee):
         kinematics = self._kinematics(data, q, v)
         on_insert = np.zeros(6)
         if self.contact is not None:
-            contact = self._contact_at(data, kinematics)
+            contact = self.contact_at(data, kinematics)
             on_insert = self.contact.wrench(contact, self.bridge.twist(data.data))
         if self._crossing is not None:
             on_insert = on_insert + self._crossing.wrench(kinematics.pose)
@@ -144,27 +144,10 @@ class Knee(AssembledKnee):
         self, data: KneeData, kinematics: KneePose, muscle_tensions: Mapping[str, float]
     ) -> list[PointForces]:
         """Return the loads of the extensor mechanism, and of ligaments that end on the patella."""
-        pulls, patella = self._pulls(muscle_tensions), None
-        if not self._others and not pulls:
+        if not self.loads_patella(muscle_tensions):
             return []
-        if self.extensor_lines is not None:
-            patella = self._find_patella(kinematics, data)
-        poses, total = self._link_poses(kinematics, patella), list[PointForces]()
-        if self._others:
-            from tkamb.knee.ligaments import ligament_loads
-
-            total += ligament_loads(self._others, poses)[1]
-        if pulls:
-            assert patella is not None and self.extensor_lines is not None
-            quadriceps = muscle_tensions[self._extensor_names[0]]
-            total += self.extensor_lines.pull(
-                poses,
-                patella,
-                kinematics.coordinates[5],
-                quadriceps,
-                muscle_tensions.get(PATELLAR_LIGAMENT),
-            )
-        return total
+        patella = None if self.extensor_lines is None else self._find_patella(kinematics, data)
+        return self.loads_beside(kinematics, patella, muscle_tensions)
 
     def stiffness(
         self, q: Array, v: Array, data: KneeData | None = None, exact: bool = True
@@ -191,9 +174,9 @@ class Knee(AssembledKnee):
         total = np.zeros((6, 6))
         if self.contact is not None:
             twist = self.bridge.twist(data.data)
-            contact = self._contact_at(data, kinematics)
+            contact = self.contact_at(data, kinematics)
             total += self.contact.stiffness(data.probe, kinematics.pose, contact, twist, exact)
-        total += self._ligament_stiffness(kinematics)
+        total += self.crossing_stiffness(kinematics)
         return self._mirrored_matrix(total)
 
     def damping(self, q: Array, v: Array, data: KneeData | None = None) -> Array:
@@ -206,8 +189,148 @@ class Knee(AssembledKnee):
         kinematics = self._kinematics(data, q, v)
         if self.contact is None:
             return np.zeros((6, 6))
-        contact = self._contact_at(data, kinematics)
+        contact = self.contact_at(data, kinematics)
         return self._mirrored_matrix(self.contact.damping(contact, self.bridge.twist(data.data)))
+
+    def external_forces_derivatives(
+        self,
+        q: Array,
+        v: Array,
+        tensions: Mapping[str, float] | float | None = None,
+        data: KneeData | None = None,
+    ) -> tuple[Array, Array]:
+        """Return the derivatives of `external_forces` by q and by v.
+
+        The equations are in `tkamb.knee.derivatives`. The derivative is total: it contains the
+        rotation of the forces with the bodies. Use it with `pin.computeABADerivatives`, which holds
+        the forces constant in the joints' frames.
+
+        Args:
+            q: configuration, shape (nq,).
+            v: velocity, shape (nv,).
+            tensions: muscle tensions, see `external_forces`.
+            data: data from `create_data`, to save time.
+
+        Returns:
+            df_dq and df_dv, each (njoints, 6, nv), in the tangent space of q: derivative of each
+            joint's force in its joint's frame, N and N·m per m, rad, m/s or rad/s.
+
+        Raises:
+            InputError: see `external_forces`.
+            ComputationError: see `external_forces`.
+        """
+        from tkamb.knee.derivatives import force_derivatives
+
+        return force_derivatives(self, q, v, tensions, self.create_data() if data is None else data)
+
+    def forward_dynamics(
+        self,
+        q: Array,
+        v: Array,
+        tau: Array,
+        fext: Any = None,
+        tensions: Mapping[str, float] | float | None = None,
+        data: KneeData | None = None,
+    ) -> Array:
+        """Return the acceleration (nv,): `pin.aba` with the forces of `external_forces`.
+
+        Args:
+            q: configuration, shape (nq,).
+            v: velocity, shape (nv,).
+            tau: torques and forces of the joints, shape (nv,), N·m and N.
+            fext: other external forces on the joints, as `fext` of `pin.aba`; None: zero.
+            tensions: muscle tensions, see `external_forces`.
+            data: data from `create_data`, to save time.
+
+        Raises:
+            InputError: see `external_forces`.
+            ComputationError: see `external_forces`.
+        """
+        data = self.create_data() if data is None else data
+        forces = self._with_external(self.external_forces(q, v, tensions, data), fext)
+        return np.array(pin.aba(self.model, data.data, q, v, self._check_tau(tau), forces))
+
+    def forward_dynamics_derivatives(
+        self,
+        q: Array,
+        v: Array,
+        tau: Array,
+        fext: Any = None,
+        tensions: Mapping[str, float] | float | None = None,
+        data: KneeData | None = None,
+    ) -> tuple[Array, Array, Array]:
+        """Return da_dq, da_dv and da_dtau (nv, nv) of `forward_dynamics`, in the tangent space.
+
+        `fext` is constant in the joints' frames. The arguments are those of `forward_dynamics`.
+
+        Raises:
+            InputError: see `external_forces`.
+            ComputationError: see `external_forces`.
+        """
+        from tkamb.knee.derivatives import generalised
+
+        data = self.create_data() if data is None else data
+        model, pin_data = self.model, data.data
+        forces = self._with_external(self.external_forces(q, v, tensions, data), fext)
+        by_q, by_v = self.external_forces_derivatives(q, v, tensions, data)
+        # Pinocchio's derivatives change the Jacobians in `data`.
+        change, rate = (generalised(model, pin_data, one) for one in (by_q, by_v))
+        pin.computeABADerivatives(model, pin_data, q, v, self._check_tau(tau), forces)
+        inverse_mass = np.array(pin_data.Minv)
+        return (
+            pin_data.ddq_dq + inverse_mass @ change,
+            pin_data.ddq_dv + inverse_mass @ rate,
+            inverse_mass,
+        )
+
+    def inverse_dynamics_derivatives(
+        self,
+        q: Array,
+        v: Array,
+        a: Array,
+        fext: Any = None,
+        tensions: Mapping[str, float] | float | None = None,
+        data: KneeData | None = None,
+    ) -> tuple[Array, Array, Array]:
+        """Return the derivatives of `pin.rnea` with the forces of `external_forces`.
+
+        The joint torques are tau = pin.rnea(model, data, q, v, a, fext), with the knee's forces.
+
+        Args:
+            q: configuration, shape (nq,).
+            v: velocity, shape (nv,).
+            a: acceleration, shape (nv,).
+            fext: other external forces, constant in the joints' frames; None: zero.
+            tensions: muscle tensions, see `external_forces`.
+            data: data from `create_data`, to save time.
+
+        Returns:
+            dtau_dq, dtau_dv and dtau_da, each (nv, nv), in the tangent space of q.
+
+        Raises:
+            InputError: see `external_forces`.
+            ComputationError: see `external_forces`.
+        """
+        from tkamb.knee.derivatives import generalised
+
+        data = self.create_data() if data is None else data
+        model, pin_data = self.model, data.data
+        forces = self._with_external(self.external_forces(q, v, tensions, data), fext)
+        by_q, by_v = self.external_forces_derivatives(q, v, tensions, data)
+        change, rate = (generalised(model, pin_data, one) for one in (by_q, by_v))
+        a = self._check(a, "a", model.nv)
+        by_q, by_v, by_a = pin.computeRNEADerivatives(model, pin_data, q, v, a, forces)
+        mass = np.triu(by_a) + np.triu(by_a, 1).T
+        return by_q - change, by_v - rate, mass
+
+    def _with_external(self, forces: Any, fext: Any) -> Any:
+        if fext is None:
+            return forces
+        self._check_external(fext)
+        return pin.StdVec_Force([f + e for f, e in zip(forces, fext, strict=True)])
+
+    def _check_tau(self, tau: Array) -> Array:
+        return self._check(tau, "tau", self.model.nv)
 
     def inverse_dynamics(
         self,
@@ -426,10 +549,7 @@ class Knee(AssembledKnee):
         data = self.create_data_for_kinematics() if data is None else data
         q = self._check(q, "q", self.model.nq)
         v, a = self._check(v, "v", self.model.nv), self._check(a, "a", self.model.nv)
-        if external is not None and len(external) != self.model.njoints:
-            raise InputError(
-                f"{len(external)} forces", "external", f"give one per joint, {self.model.njoints}"
-            )
+        self._check_external(external)
         muscle_tensions = self._tensions(tensions)
         if self._pulls(muscle_tensions):
             raise InputError(
@@ -459,7 +579,13 @@ class Knee(AssembledKnee):
             muscles,
         )
 
-    def _contact_at(self, data: KneeData, kinematics: KneePose) -> "ProbedContact":
+    def _check_external(self, external: Any) -> None:
+        if external is not None and len(external) != self.model.njoints:
+            raise InputError(
+                f"{len(external)} forces", "external", f"give one per joint, {self.model.njoints}"
+            )
+
+    def contact_at(self, data: KneeData, kinematics: KneePose) -> "ProbedContact":
         """Return the contact at a pose. The last contact is stored in `data`."""
         key = kinematics.pose.tobytes()
         if data.seen is None or data.seen[0] != key:
@@ -467,15 +593,11 @@ class Knee(AssembledKnee):
             data.seen = key, self.contact.at(data.probe, kinematics.pose)
         return data.seen[1]
 
-    def _ligament_stiffness(self, kinematics: KneePose) -> Array:
+    def crossing_stiffness(self, kinematics: KneePose) -> Array:
         """Return the stiffness (6, 6) of the ligaments between femur and tibia."""
         if self._crossing is None:
             return np.zeros((6, 6))
-        from tkamb.knee.contact import DifferenceSettings, batch_differences
-
-        return batch_differences(
-            self._crossing.wrench, kinematics.pose, DifferenceSettings(step=1e-7)
-        )
+        return self._crossing.tangent(kinematics.pose)
 
     def _mirrored_matrix(self, matrix: Array) -> Array:
         if not self.left:
