@@ -18,6 +18,7 @@ import pinocchio as pin
 from tkamb.errors import ComputationError, InputError, names_near
 from tkamb.geometry.frames import (
     KNEE_COORDINATES,
+    SIDES,
     Array,
     knee_pose,
 )
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from tkamb.contact.model import ProbedContact
     from tkamb.contact.result import ContactResult, Guess, WarmStart
     from tkamb.knee.released import KneeEquilibrium
+    from tkamb.knee.solution_derivatives import EquilibriumDerivatives, PressDerivatives
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +52,7 @@ class Equilibrium:
             25 mm).
         problem: reason why there is no equilibrium; empty: there is an equilibrium.
         search: details of the search.
+        derivatives: derivatives of the equilibrium; None: not asked for, or no equilibrium.
     """
 
     q: Array
@@ -60,6 +63,7 @@ class Equilibrium:
     stiffness: Array
     problem: str
     search: "KneeEquilibrium"
+    derivatives: "EquilibriumDerivatives | None" = None
 
 
 class Knee(AssembledKnee):
@@ -111,8 +115,8 @@ class Knee(AssembledKnee):
         massless here: it transmits the quadriceps' tension to patellar ligament and femur.
 
         Args:
-            q: configuration, shape (nq,).
-            v: velocity, shape (nv,).
+            q: configuration, shape (nq,); or (n, nq) for n configurations.
+            v: velocity, shape (nv,); or (n, nv).
             tensions: muscle -> tension, N; or the tension of the quadriceps alone, N. Muscles
                 without a tension are slack. If "patellar_ligament" is given with the quadriceps, as
                 in `KneeLoads.tensions`, the patellofemoral force balances these two tensions.
@@ -120,13 +124,17 @@ class Knee(AssembledKnee):
 
         Returns:
             `pin.StdVec_Force`, one per joint in its joint's frame: `fext` of `pin.rnea` and
-            `pin.aba`.
+            `pin.aba`. For n configurations an array (n, njoints, 6).
 
         Raises:
             InputError: q or v has the wrong size, or a muscle is unknown.
             ComputationError: the contact model is out of its range, or the patella is not found.
         """
         data = self.create_data() if data is None else data
+        if np.ndim(q) == 2:
+            from tkamb.knee.batches import forces_of_all
+
+            return forces_of_all(self, q, v, tensions, data)
         kinematics = self._kinematics(data, q, v)
         on_insert = np.zeros(6)
         if self.contact is not None:
@@ -148,6 +156,29 @@ class Knee(AssembledKnee):
             return []
         patella = None if self.extensor_lines is None else self._find_patella(kinematics, data)
         return self.loads_beside(kinematics, patella, muscle_tensions)
+
+    def condyle_forces(self, q: Array, data: KneeData | None = None) -> tuple[Array, Array]:
+        """Return the contact forces (2,), N, of medial and lateral condyle, and their derivative.
+
+        A force is the magnitude of the condyle's resultant, without friction, at the overlap of q.
+        The derivative (2, nv) by q is in the tangent space, N/m and N/rad.
+
+        Raises:
+            InputError: the knee has no contact model, or the model has no exact tangent.
+            ComputationError: the contact model is out of its range.
+        """
+        contact, data = self._need_contact(), self.create_data() if data is None else data
+        twists = self.relative_jacobian(q, data)
+        twists = mirrored_spatial(twists.T).T if self.left else twists
+        probed = self.contact_at(data, self.at(q, data))
+        if not (probed.tangent and probed.exact):
+            raise InputError(f"{contact.model.name} has no exact tangent", "condyle_forces")
+        forces, slopes = np.zeros(2), np.zeros((2, self.model.nv))
+        for k, side in enumerate(SIDES):
+            if side in probed.condyles:
+                forces[k] = probed.condyles[side].force
+                slopes[k] = probed.condyles[side].force_slope @ twists
+        return forces, slopes
 
     def stiffness(
         self, q: Array, v: Array, data: KneeData | None = None, exact: bool = True
@@ -383,24 +414,51 @@ class Knee(AssembledKnee):
     def press(
         self,
         q: Array,
-        load: float,
+        load: float | Array,
         guess: "Guess | None" = None,
-    ) -> "ContactResult":
+        derivatives: bool = False,
+    ) -> Any:
         """Return the contact under a load, at the rotations, AP and ML of q.
 
         Args:
-            q: configuration, shape (nq,).
-            load: compressive force along the insert's y axis, 0 or more, N.
+            q: configuration, shape (nq,); or (n, nq) for n poses.
+            load: compressive force along the insert's y axis, 0 or more, N; or one per pose, (n,).
             guess: an earlier result or a warm start, to save time.
+            derivatives: whether the derivatives by load and pose are returned, too.
 
         Returns:
-            Pressure, area and forces of both condyles, in the insert frame of a right knee: a
-            left knee is computed as its mirror image (z to -z).
+            A `ContactResult`: pressure, area and forces of both condyles, in the insert frame of a
+            right knee: a left knee is computed as its mirror image (z to -z). With derivatives, it
+            and `tkamb.knee.solution_derivatives.PressDerivatives`. For n poses a
+            `tkamb.knee.batches.PressBatch`.
 
         Raises:
-            InputError: the knee has no contact model, or the load is negative or not finite.
+            InputError: the knee has no contact model, the load is negative or not finite, or
+                derivatives are asked of a contact model without an exact tangent.
         """
-        return self.press_from(q, load, guess)[0]
+        if np.ndim(q) == 2:
+            from tkamb.knee.batches import press_all
+
+            return press_all(self, q, load, guess, derivatives)
+        result, start = self.press_from(q, float(load), guess)
+        return (result, self.press_slopes(result, start)) if derivatives else result
+
+    def press_slopes(self, result: "ContactResult", start: "WarmStart") -> "PressDerivatives":
+        """Return the derivatives of a press from its result and warm start.
+
+        Raises:
+            InputError: the contact model has no exact tangent.
+            ComputationError: the press failed.
+        """
+        from tkamb.knee.solution_derivatives import exact_tangent, press_derivatives
+
+        contact = self._need_contact()
+        if result.status.value == "out_of_range":
+            raise ComputationError("; ".join(result.flags), "press")
+        probed = contact.probe(start).seen(result, start)
+        exact_tangent(probed, contact.model.name)
+        slopes = press_derivatives(contact.pair, result.pose, probed)
+        return replace(slopes, by_pose=mirrored_spatial(slopes.by_pose)) if self.left else slopes
 
     def press_from(
         self, q: Array, load: float, start: "Guess | None" = None
@@ -436,6 +494,7 @@ class Knee(AssembledKnee):
         released: Sequence[str] = ("ap", "ml", "axial_rotation", "adduction"),
         tensions: Mapping[str, float] | None = None,
         data: KneeData | None = None,
+        derivatives: bool = False,
     ) -> Equilibrium:
         """Return the pose at which the released coordinates are in equilibrium, with its loads.
 
@@ -451,10 +510,14 @@ class Knee(AssembledKnee):
             released: some of "ap", "ml", "axial_rotation", "adduction"; "si" is always released.
             tensions: muscle tensions, see `inverse_dynamics`.
             data: data from `create_data`, to save time.
+            derivatives: whether the result has the derivatives of coordinates and condyle forces by
+                load, prescribed coordinates, slack lengths and stiffnesses
+                (`tkamb.knee.solution_derivatives`).
 
         Raises:
-            InputError: a coordinate is unknown, the knee has no contact model, or the joints
-                between tibia and femur have too few degrees of freedom for the pose.
+            InputError: a coordinate is unknown, the knee has no contact model, the joints between
+                tibia and femur have too few degrees of freedom for the pose, or derivatives are
+                asked of a contact model without an exact tangent.
             ComputationError: the femur does not lie over the insert.
         """
         from tkamb.knee.released import ReleasedKnee
@@ -479,6 +542,9 @@ class Knee(AssembledKnee):
                 knee.geometry, knee.coordinates, knee.contact.condyles, points
             )
         loads = self._solved(instant, geometry, data)
+        slopes = None
+        if derivatives and not knee.problem:
+            slopes = self._equilibrium_derivatives(search, instant, knee, points)
         return Equilibrium(
             q_end,
             knee.coordinates,
@@ -488,7 +554,20 @@ class Knee(AssembledKnee):
             knee.balance.stiffness,
             knee.problem,
             knee,
+            slopes,
         )
+
+    def _equilibrium_derivatives(
+        self, search: Any, instant: Instant, knee: "KneeEquilibrium", points: dict[str, Array]
+    ) -> "EquilibriumDerivatives":
+        from tkamb.knee.solution_derivatives import ImplicitEquilibrium, exact_tangent
+
+        exact_tangent(knee.contact, self._need_contact().model.name)
+        slopes = ImplicitEquilibrium(search, instant, knee, points).derivatives()
+        if self.left:
+            # Coordinates are those of the mirror image; the load is in the user's frame.
+            slopes = replace(slopes, by_load=mirrored_spatial(slopes.by_load))
+        return slopes
 
     def show(self, viewer: Any, q: Array, **options: Any) -> None:
         """Draw the knee at q in a user's `pin.visualize.MeshcatVisualizer`.
