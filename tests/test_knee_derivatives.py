@@ -191,7 +191,7 @@ def test_a_press(read, monkeypatch):
     monkeypatch.setattr(pressing, "PRESS", sharp)
     monkeypatch.setattr(foundation, "PRESS", sharp)
     knee, motion = knee_of(read[0]), read[1]
-    q = motion.q[60]
+    q = pressed(knee, motion.q[60], 1200.0)  # by_pose belongs to the pressed pose
     result, found = knee.press(q, 1200.0, derivatives=True)
 
     def values(q, load):

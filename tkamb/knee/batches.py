@@ -62,14 +62,18 @@ def press_all(
     results, slopes, start = [], [], guess
     for one, its_load in zip(np.asarray(q, float), np.broadcast_to(load, count), strict=True):
         result, next_start = knee.press_from(one, float(its_load), start)
+        # A failed press has no pressures to start from.
         if result.status is ContactStatus.OK:
             start = next_start
         if derivatives:
             slopes.append(knee.press_slopes(result, next_start))
         results.append(result)
+    force, peak, area = (_of_condyles(results, one) for one in ("force", "peak_pressure", "area"))
     return PressBatch(
         tuple(results),
-        *(_of_condyles(results, name) for name in ("force", "peak_pressure", "area")),
+        force,
+        peak,
+        area,
         np.array([one.approach for one in results]),
         np.array([one.pose for one in results]),
         np.array([one.pressure for one in results]),
@@ -82,6 +86,7 @@ def _of_condyles(results: list[ContactResult], name: str) -> Array:
     values = np.zeros((len(results), len(SIDES)))
     for k, result in enumerate(results):
         for i, side in enumerate(SIDES):
+            # An unloaded condyle has no contact: its values are zero.
             condyle = getattr(result, side)
             values[k, i] = 0.0 if condyle is None else getattr(condyle, name)
         if result.status is ContactStatus.OUT_OF_RANGE:

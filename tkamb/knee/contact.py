@@ -157,6 +157,7 @@ class KneeContact:
         by_sliding = _cross_matrix(twist[3:]) @ by_point
         along = float(sliding @ normal)
         tangential = sliding - along * normal
+        # Product rule for t = s - (s . n) n.
         by_tangential = (
             by_sliding
             - np.outer(normal, normal @ by_sliding + sliding @ by_normal)

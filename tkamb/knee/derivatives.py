@@ -109,6 +109,7 @@ def force_derivatives(
         joint, to_joint = knee.bridge.joint_of(link), knee.bridge.to_joint(data.data, link)
         wrench, change, rate = (_users(knee, m[link]) for m in (wrenches, by_q, by_v))
         twist = {"femur": twists.femur, "patella": twists.patella}.get(link)
+        # The tibia does not move against the insert; the other bodies do.
         if twist is not None:
             change = change - force_cross(twist, wrench)
         df_dq[joint] += to_joint @ change
@@ -143,6 +144,7 @@ def relative_twists(knee: "Knee", q: Array, data: "KneeData") -> RelativeTwists:
     pose = bridge.of_right_knee(plane.actInv(placement))
     centre = in_plane[:3] + np.cross(in_plane[3:].T, pose[:3, 3]).T
     front = np.cross(in_plane[3:].T, pose[:3, 0]).T
+    # The rotation is the angle of the patella's x axis in the plane: d atan2(y, x).
     x, y = pose[0, 0], pose[1, 0]
     rotation = (x * front[1] - y * front[0]) / (x**2 + y**2)
     return RelativeTwists(femur, patella, np.stack([centre[0], centre[1], rotation]))
@@ -193,6 +195,7 @@ def _between(
                 by_q = damping @ _users(knee, twist_derivative(knee, data.data, twists.femur, q, v))
     if knee.crossing is not None:
         on_insert += knee.crossing.wrench(kinematics.pose)
+    # Action and reaction: the femur's wrench is the opposite of the tibia's.
     by_q = by_q + stiffness @ femur
     zero = np.zeros(6), np.zeros_like(by_q), np.zeros_like(by_q)
     total = on_insert, by_q, by_v
@@ -271,6 +274,7 @@ def _beside(
     slopes = {link: by_pose[link] @ femur for link in LINKS}
     if patella is not None:
         change = twists.coordinates
+        # Without a patella in the model its equilibrium gives its movement.
         if change is None:
             change = _patella_slopes(knee, kinematics, patella) @ femur
         slopes = {link: slopes[link] + by_patella[link] @ change for link in LINKS}

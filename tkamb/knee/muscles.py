@@ -331,6 +331,7 @@ class TensionLine:
             back = placement.rotation.T
             pull = back @ (tension * (ahead[k] - behind[k]))
             change = back @ (tension * (ahead_turn[k] - behind_turn[k]))
+            # The axes of the joint turn under the force.
             change = change - np.cross(spins[k].T, pull).T
             changes[frame.joint, :3] += change
             changes[frame.joint, 3:] += np.cross(placement.actInv(points[k]), change.T).T

@@ -39,9 +39,9 @@ class PressDerivatives:
 
     Args:
         by_load: derivative by the load, shape (4,), 1 and m/N.
-        by_pose: derivative by a displacement of the femur before the press, shape (4, 6): the
+        by_pose: derivative by a displacement of the femur at the pressed pose, shape (4, 6): the
             translation (m) of its point at the insert's origin, then the rotation (rad), in the
-            insert frame. The translation along y has no effect.
+            insert frame. The press then changes the height; the translation along y has no effect.
     """
 
     by_load: Array
@@ -93,6 +93,7 @@ def press_derivatives(
     by_pose[:2] = slopes + np.outer(slopes[:, 1], height_by_pose)
     by_pose[3] = origin + height_by_pose
     by_pose[2] = _touch_slope(pair, pose) - by_pose[3]
+    # The press determines the height, whatever it was before.
     by_pose[:, 1] = 0.0
     return PressDerivatives(by_load, by_pose)
 
@@ -162,6 +163,7 @@ class ImplicitEquilibrium:
     ) -> None:
         self._search, self._instant, self._knee, self._points = search, instant, knee, points
         here = [np.abs(self._forces(knee.coordinates, slack)).max() for slack in (False, True)]
+        # The search does not store whether the extensor mechanism was slack: the residual tells.
         self._slack = bool(here[1] < here[0])
 
     def derivatives(self) -> EquilibriumDerivatives:
@@ -176,6 +178,7 @@ class ImplicitEquilibrium:
                 for move, size in zip(np.diag(sizes), sizes, strict=True)
             ]
         )
+        # The implicit function theorem: the released coordinates restore zero forces.
         inverse = np.linalg.inv(by_coordinate[:, rows])
         held = [k for k in range(6) if k not in rows]
         held_columns = np.zeros((8, 6))
