@@ -3,7 +3,7 @@
     import tkamb
     scene = tkamb.load_scene("models/deep_knee_bend/scene.toml")
     results = tkamb.simulate(scene, contact="foundation")
-    model = tkamb.contact_model("hertz", resolution_mm=1.0)
+    model = tkamb.contact_model("hertz", resolution=1e-3)
 
 Each name is imported when it is first used.
 """
@@ -13,8 +13,6 @@ from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-from tkamb.moved import accept_old_names
 
 if TYPE_CHECKING:
     from tkamb.contact.registry import contact_model
@@ -29,6 +27,7 @@ if TYPE_CHECKING:
     from tkamb.run.results import Results
     from tkamb.run.results_folder import read_results
     from tkamb.run.simulation import simulate
+    from tkamb.show.plots import plot
     from tkamb.show.view.live_window import live
     from tkamb.show.view.show import show as view
 
@@ -48,6 +47,7 @@ __all__ = [
     "contact_model",
     "live",
     "load_scene",
+    "plot",
     "read_results",
     "read_scene",
     "simulate",
@@ -69,6 +69,7 @@ _HOMES = {
     "contact_model": "tkamb.contact.registry",
     "live": "tkamb.show.view.live_window",
     "load_scene": "tkamb.io.scene",
+    "plot": "tkamb.show.plots",
     "read_results": "tkamb.run.results_folder",
     "read_scene": "tkamb.run.read_scene",
     "view": "tkamb.show.view.show:show",
@@ -76,8 +77,6 @@ _HOMES = {
 }
 
 __version__ = "0.2.0"
-
-accept_old_names()
 
 
 @lru_cache(maxsize=4)
@@ -99,8 +98,6 @@ def code_identity(part: str = "") -> str:
 
 
 def __getattr__(name: str) -> Any:
-    if name == "show":  # the subpackage; `tkamb.show(...)` is the former name of `tkamb.view(...)`
-        return import_module("tkamb.show")
     if name not in _HOMES:
         raise AttributeError(f"module 'tkamb' has no attribute '{name}'")
     module, _, attribute = _HOMES[name].partition(":")

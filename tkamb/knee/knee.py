@@ -9,7 +9,6 @@ prints nothing, and does not change the result of the next call.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -578,25 +577,6 @@ class Knee(AssembledKnee):
         from tkamb.knee.show import show_knee
 
         show_knee(self, viewer, q, **options)
-
-    def live(self, q: Array, load: float = 1000.0, folder: Any = None) -> Any:
-        """Serve a page on which a user moves and loads the knee by hand (docs/live.md).
-
-        The load acts along the insert's y axis, in addition to the ligaments between femur and
-        tibia. The page does not change this object.
-
-        Args:
-            q: configuration, shape (nq,), or (f, nq) for the slider "recorded frame".
-            load: first value of the load, N.
-            folder: folder for saved scenes; None: out/live.
-
-        Returns:
-            The server. Its address is `url`; it runs until `close()`.
-
-        Raises:
-            InputError: the contact model is missing, or `tkamb.contact_model` did not make it.
-        """
-        return import_module("tkamb.show.view.live_window").live_knee(self, q, load, folder)
 
     def instant(
         self,
