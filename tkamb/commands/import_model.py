@@ -81,6 +81,23 @@ def add_import(commands: Any) -> None:
         help="standing trial, which gives the marker positions on the segments",
     )
     command.add_argument(
+        "--register",
+        action=argparse.BooleanOptionalAction,
+        default=None,
+        help="find the marker positions on the segments together with the motion; default: where "
+        "the markers misfit the model by over 10 mm, or the knee centres by over 20 mm",
+    )
+    command.add_argument(
+        "--with",
+        dest="companions",
+        type=Path,
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="TRIAL",
+        help="recordings of the same markers on the same day, which the registration uses as well",
+    )
+    command.add_argument(
         "--side", choices=("right", "left"), required=True, help="side of the knee"
     )
     command.add_argument(
@@ -322,6 +339,8 @@ def import_request(options: argparse.Namespace) -> "ImportRequest":
             raise InputError("is for the plates of a .c3d: tables are in N and N·m", option)
     if options.length_unit and options.motion:
         raise InputError("is for recordings of markers", "--length-unit", "leave it out")
+    if options.companions and options.register is False:
+        raise InputError("is for --register", "--with", "leave out --no-register or --with")
     if options.grf_force and not options.grf:
         raise InputError("needs --grf", "--grf-force")
     if Path(options.scene).name != options.scene or not options.scene.endswith(".toml"):
@@ -337,6 +356,8 @@ def import_request(options: argparse.Namespace) -> "ImportRequest":
         poses=_poses(options),
         without=options.without,
         static=options.static,
+        register=options.register,
+        companions=tuple(options.companions),
         meshes=_meshes(options),
         knee=options.knee,
         frames={

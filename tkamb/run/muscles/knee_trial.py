@@ -16,6 +16,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, inverse, transform
 from tkamb.io.importing.anatomy import Leg, find_leg
 from tkamb.io.importing.links import Links, find_links
+from tkamb.io.importing.markers import placed_markers
 from tkamb.io.importing.model_fit import fit_model
 from tkamb.io.opensim.kinematics import Kinematics
 from tkamb.io.opensim.motion import CoordinateMotion, coordinate_motion, read_coordinates
@@ -208,6 +209,8 @@ class LegRecording:
             None: no implant.
         mesh_axes: axes of the mesh that point anterior, superior and right.
         sharing: options.
+        points: segment -> label -> position of a marker, m, (3,), where it differs from the
+            model's, see `placed_markers`.
     """
 
     model: Path
@@ -220,6 +223,7 @@ class LegRecording:
     insert_placement: Array | None
     mesh_axes: str
     sharing: Sharing
+    points: Mapping[str, Mapping[str, Array]] = field(default_factory=dict)
 
 
 def load_knee_trial(source: LegRecording, time: Array) -> tuple[Links, KneeTrial]:
@@ -233,14 +237,13 @@ def load_knee_trial(source: LegRecording, time: Array) -> tuple[Links, KneeTrial
         InputError: a file or an option cannot be used.
     """
     leg = _read_leg(source.model, source.side)
-    model = leg.model
     links = find_links(leg, source.insert_placement, source.mesh_axes, {}, False)
-    motion = _motion(source, Kinematics(model), time)
+    motion = _motion(source, Kinematics(placed_markers(links, source.points)), time)
     loads = {}
     if source.ground is not None:
         # "right" means no mirroring: the model has the leg of the recorded side
         reaction = load_ground_reaction(source.ground, time, "right")
-        loads = foot_loads(model, {source.side: reaction})
+        loads = foot_loads(leg.model, {source.side: reaction})
     return links, knee_trial(links, motion, loads, source.sharing)
 
 

@@ -224,6 +224,12 @@ def load_muscles(case: Case) -> SharedMuscles:
         insert_placement=case.insert_placement,
         mesh_axes="+x,+y,+z" if insert is None else insert.axes,
         sharing=sharing_of(table),
+        points={
+            segment.name: {
+                label: np.array(place) * MILLIMETRE for label, place in segment.markers_mm.items()
+            }
+            for segment in (markers.segment if markers else ())
+        },
     )
     links, trial = load_knee_trial(source, case.motion.time)
     _check_links(case, links.insert_in_tibia, links.hip)
