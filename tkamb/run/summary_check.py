@@ -154,7 +154,7 @@ TABLES = {
             "exponent": "number",
             "least_activation": "number",
             "law": "text",
-            "reserve_Nm": ("number", {ANY_KEY: "number"}),
+            "reserve_Nm": ("number", {ANY_KEY: "number"}, "null"),
         },
         "contact": {
             "model": "text",

@@ -326,6 +326,8 @@ def _extensor(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterator
 
 
 def _reserves(value: Any) -> str:
+    if value is None:
+        return "10 N·m at knee, ankle and subtalar joint, without cost at the hip"
     if isinstance(value, Mapping):
         return ", ".join(f"{name} {moment:g} N·m" for name, moment in value.items())
     return f"{value:g} N·m at each coordinate"

@@ -14,7 +14,7 @@ from tkamb.geometry.surface import Surface
 from tkamb.io.importing.anatomy import Leg, find_leg
 from tkamb.io.importing.links import Links, find_links, patient_urdf
 from tkamb.io.importing.marked_trials import with_registered_markers
-from tkamb.io.importing.markers import recorded_labels, with_prefix
+from tkamb.io.importing.markers import ModelSegment, recorded_labels, with_prefix
 from tkamb.io.importing.model_motion import MOTION_FILE
 from tkamb.io.importing.recorded_poses import read_poses
 from tkamb.io.importing.registration import Registration
@@ -74,6 +74,7 @@ class ImportedPatient:
         ground: text of ground_reaction.csv; None: the scene reads the recorded forces, if any.
         registration: registered markers; None: their positions are the model's or of a standing
             trial.
+        model_segments: segments with the positions before the registration; () without one.
     """
 
     urdf: str
@@ -82,6 +83,7 @@ class ImportedPatient:
     report: tuple[str, ...]
     ground: str | None = None
     registration: Registration | None = None
+    model_segments: tuple[ModelSegment, ...] = ()
 
 
 def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
@@ -153,8 +155,9 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
         unit = request.units.length
         scene, lines = with_static_markers(scene, request.static, segments, unit)
         report += lines
-    registration = None
+    registration, before = None, ()
     if scene.markers is not None:
+        before = scene.markers.segments
         scene, registration, lines = with_registered_markers(scene, request, links)
         report += lines
     elif request.register or request.companions:
@@ -165,7 +168,13 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
     motion = result.motion.text() if result.motion else None
     ground = result.ground.made if result.ground else None
     return ImportedPatient(
-        patient_urdf(links, scale, comment), scene, motion, tuple(report), ground, registration
+        patient_urdf(links, scale, comment),
+        scene,
+        motion,
+        tuple(report),
+        ground,
+        registration,
+        before,
     )
 
 

@@ -255,13 +255,10 @@ class _MarkedLeg:
         ]
         self.size = first + 3 * len(self.balls) + HELD
         settings = REGISTRATION
-        held = [*settings.offset_mm], [*settings.offset_deg]
-        scatter = [*settings.scatter_mm], [*settings.scatter_deg]
         units = np.array([MILLIMETRE] * 3 + [DEGREE] * 2)
-        self.scatter = np.array(sum(scatter, [])) * units
-        self.held = np.concatenate(
-            [np.full(3 * len(self.balls), settings.joint), np.array(sum(held, [])) * units]
-        )
+        offset = np.array([*settings.offset_mm, *settings.offset_deg]) * units
+        self.scatter = np.array([*settings.scatter_mm, *settings.scatter_deg]) * units
+        self.held = np.concatenate([np.full(3 * len(self.balls), settings.joint), offset])
         self.prior = self.prior_at(np.zeros(self.size))
         skin = dict(settings.skin_mm)
         self.skin = np.concatenate(

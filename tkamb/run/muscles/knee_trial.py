@@ -25,7 +25,14 @@ from tkamb.io.recordings.filtering import Cutoff
 from tkamb.io.recordings.ground_reaction import load_ground_reaction
 from tkamb.io.recordings.recording_tables import GroundReactionTable, Side
 from tkamb.io.recordings.tables import read_table
-from tkamb.run.muscles.leg import foot_loads, leg_bones, leg_muscles, muscle_groups
+from tkamb.knee.condyle_rows import CondyleRows
+from tkamb.run.muscles.leg import (
+    default_reserves,
+    foot_loads,
+    leg_bones,
+    leg_muscles,
+    muscle_groups,
+)
 from tkamb.run.muscles.sharing import FrameProblems, Sharing
 from tkamb.run.muscles.trial import Bones, trial_problems
 
@@ -86,7 +93,12 @@ class KneeTrial:
         )
 
     def solved(
-        self, k: int, moment: float, extensor_arm: float, arms: Array
+        self,
+        k: int,
+        moment: float,
+        extensor_arm: float,
+        arms: Array,
+        least: CondyleRows | None = None,
     ) -> tuple[FrameProblems, tuple[Array, Array, float, str]]:
         """Return the problem of frame k with the knee's row, and its solution.
 
@@ -97,6 +109,7 @@ class KneeTrial:
             moment: moment of muscles and reserve at the knee, N·m.
             extensor_arm: moment arm of the extensor group, m.
             arms: moment arms of the crossing muscles, m, (c,).
+            least: loads of the condyles that must not be negative; None: without.
         """
         problems, rows = self.problems, slice(k, k + 1)
         moments, table = problems.moment[rows].copy(), problems.arms[rows].copy()
@@ -114,8 +127,15 @@ class KneeTrial:
             active=problems.active[rows],
             passive=problems.passive[rows],
             guide=guide,
+            least=None if least is None else (least.constant, self._gain(least)),
         )
         return frame, frame.solved(0)
+
+    def _gain(self, rows: CondyleRows) -> Array:
+        """Return the changes (2, m) of the condyles' loads per newton of each muscle."""
+        gain = np.where(self.extensor, rows.extensor[:, None], 0.0)
+        gain[:, self.crossing] = rows.arms
+        return gain
 
     def force(self, k: int, activation: Array) -> Array:
         """Return the muscle forces (m,), N, in frame k at activations (m,)."""
@@ -244,7 +264,10 @@ def load_knee_trial(source: LegRecording, time: Array) -> tuple[Links, KneeTrial
         # "right" means no mirroring: the model has the leg of the recorded side
         reaction = load_ground_reaction(source.ground, time, "right")
         loads = foot_loads(leg.model, {source.side: reaction})
-    return links, knee_trial(links, motion, loads, source.sharing)
+    sharing = source.sharing
+    if sharing.reserve is None:
+        sharing = replace(sharing, reserve=default_reserves(leg))
+    return links, knee_trial(links, motion, loads, sharing)
 
 
 def group_names(model: Path, side: Side) -> tuple[str, ...]:
