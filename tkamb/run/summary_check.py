@@ -154,7 +154,8 @@ TABLES = {
             "exponent": "number",
             "least_activation": "number",
             "law": "text",
-            "reserve_Nm": ("number", {ANY_KEY: "number"}, "null"),
+            **optional({"least_condyle_share": "number"}),
+            "reserve_Nm?": ("number", {ANY_KEY: "number"}, "null"),
         },
         "contact": {
             "model": "text",

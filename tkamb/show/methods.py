@@ -321,7 +321,7 @@ def _extensor(tables: Mapping[str, Any], summary: Mapping[str, Any]) -> Iterator
         "The muscles of an OpenSim model shared the joint moments of the leg by minimising the "
         f"{weights}sum of activations to the power {muscles['exponent']:g}, frame by frame, with a "
         f"least activation of {muscles['least_activation']:g} and the force law "
-        f"'{muscles['law']}'; reserves: {_reserves(muscles['reserve_Nm'])}."
+        f"'{muscles['law']}'; reserves: {_reserves(muscles.get('reserve_Nm'))}."
     )
 
 

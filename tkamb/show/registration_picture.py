@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from tkamb.io.importing.markers import ModelSegment
     from tkamb.io.importing.registration import Registration
 
-VIEWS = (("from the side", 0, "anterior, mm"), ("from the front", 2, "right, mm"))
-"""Title, horizontal axis of the shank and its label."""
+VIEWS = ((0, "anterior, mm"), (2, "right, mm"))
+"""Horizontal axis of the shank, and its label."""
 
 
 def draw_registration(
@@ -37,9 +37,9 @@ def draw_registration(
     with settings():
         figure = new_figure(10.0, 6.0)
         axes = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.3))
-        for one, (title, axis, label) in zip(axes, VIEWS, strict=False):
+        for one, (axis, label) in zip(axes, VIEWS, strict=False):
             _draw_leg(one, links, model, found, axis)
-            one.set(title=title, xlabel=label, aspect="equal")
+            one.set(xlabel=label, aspect="equal")
         axes[0].set_ylabel("superior of the ankle, mm")
         _draw_residuals(axes[2], found)
     return figure
