@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tkamb.errors import ComputationError
-from tkamb.geometry.frames import SIDES, Array, knee_pose
+from tkamb.geometry.frames import SIDES, Array, knee_coordinates
 from tkamb.knee.crossing import CrossingLines, tension_by_ligament
 from tkamb.knee.equations import KneeGeometry
 from tkamb.knee.load import PointForces, wrench_of
@@ -63,22 +63,23 @@ def condyle_rows(
         lines: lines of action of the muscles that cross the knee.
         points: side -> contact point (3,), m, insert frame, for each condyle in contact.
     """
-    if not points or geometry.extensor is None or geometry.coordinates is None:
+    if not points or geometry.extensor is None:
         return None
     try:
         ratio, constant = tension_by_ligament(geometry)
     except ComputationError:
         return None
     state, chain = geometry.state, geometry.state.chain
-    known = external_wrench(geometry, geometry.coordinates)
+    coordinates = knee_coordinates(state.pose("femur"))
+    known = external_wrench(geometry, coordinates)
     for load in (*geometry.ligaments, *geometry.post):
         if chain.on_shank(load.link):
             known = known + _wrench(load)
     # the extensor group of tension Q pulls the patellar ligament with (Q - constant) / ratio
-    line = patellar_line(geometry, geometry.coordinates).wrench(knee_pose(geometry.coordinates))
+    line = patellar_line(geometry, coordinates).wrench(state.pose("femur"))
     known = known - constant / ratio * line
     pulls = lines.unit_wrenches(state.pose("tibia"), state.pose("femur"))
-    split = _split(points, float(geometry.coordinates[2]))
+    split = _split(points, float(coordinates[2]))
     return CondyleRows(split @ known, split @ line / ratio, split @ pulls.T)
 
 

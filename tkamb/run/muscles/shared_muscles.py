@@ -112,9 +112,12 @@ class FrameMuscles:
         try:
             row = flexion_row(geometry, self.lines, friction, lifted)
             points = {side: one.point for side, one in geometry.condyles.items()}
-            return self._shared(row, geometry, {} if lifted else points)
+            share = self._shared(row, geometry, {} if lifted else points)
         except ComputationError as error:
             return self._failed(f"failed: {error.what}")
+        if lifted > geometry.lifted and self.trial.problems.sharing.least_share > 0.0:
+            return replace(share, both_loaded=False)
+        return share
 
     def share_of_yielding_knee(
         self,
