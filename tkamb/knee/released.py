@@ -367,6 +367,7 @@ class ReleasedKnee:
                 compliance @ muscle_wrench
             )
             touched = {side: condyle.point for side, condyle in contact.condyles.items()}
+            touched = touched if instant.two_condyles else {}
             share = muscles.share_of_yielding_knee(geometry, base, compliance, touched)
         else:
             points = instant.resultants(coordinates, contact.condyles)

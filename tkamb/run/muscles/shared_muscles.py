@@ -112,7 +112,7 @@ class FrameMuscles:
         try:
             row = flexion_row(geometry, self.lines, friction, lifted)
             points = {side: one.point for side, one in geometry.condyles.items()}
-            share = self._shared(row, geometry, {} if lifted else points)
+            share = self._shared(row, geometry, points if len(points) == 2 and not lifted else {})
         except ComputationError as error:
             return self._failed(f"failed: {error.what}")
         if lifted > geometry.lifted and self.trial.problems.sharing.least_share > 0.0:
