@@ -14,7 +14,7 @@ from tkamb.io.importing.registration import Registration, misfit, register
 from tkamb.io.importing.request import ImportRequest
 from tkamb.io.importing.scene_text import SceneText
 from tkamb.io.recordings.laboratory import laboratory_rotation
-from tkamb.io.recordings.markers import marker_trajectories, matched_labels
+from tkamb.io.recordings.markers import MARKER_FIT, marker_trajectories, matched_labels
 from tkamb.io.recordings.tables import Table, read_table, with_unit
 from tkamb.units import DEGREE, MILLIMETRE
 
@@ -59,14 +59,18 @@ def with_registered_markers(
     own = measured_markers(request.recording, request, segments, scene.markers.axes)
     rms, apart = misfit(links, segments, own)
     poor = rms > TRIAL_MATCH.misfit or apart > TRIAL_MATCH.knee_distance
+    if (
+        rms > MARKER_FIT.max_median_residual
+    ):  # a wrong unit or label, which loading the scene refuses
+        return scene, None, []
     if not (poor or request.companions if request.register is None else request.register):
         return scene, None, []
     trials, lines = {request.recording.name: own}, []
     for path in request.companions:
-        markers = measured_markers(path, request, segments)
-        for label in moved_markers(segments, own, markers):
+        measured = measured_markers(path, request, segments)
+        for label in moved_markers(segments, own, measured):
             lines.append(f"marker {label} sits elsewhere in {path.name} and is not used there")
-        trials[path.name] = markers
+        trials[path.name] = measured
     found = register(links, segments, trials)
     markers = replace(scene.markers, segments=found.segments)
     knee = float(np.sqrt(np.mean(found.knee_centre**2))) / MILLIMETRE

@@ -155,7 +155,8 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
         unit = request.units.length
         scene, lines = with_static_markers(scene, request.static, segments, unit)
         report += lines
-    registration, before = None, ()
+    registration: Registration | None = None
+    before: tuple[ModelSegment, ...] = ()
     if scene.markers is not None:
         before = scene.markers.segments
         scene, registration, lines = with_registered_markers(scene, request, links)
