@@ -59,10 +59,8 @@ def with_registered_markers(
     own = measured_markers(request.recording, request, segments, scene.markers.axes)
     rms, apart = misfit(links, segments, own)
     poor = rms > TRIAL_MATCH.misfit or apart > TRIAL_MATCH.knee_distance
-    if (
-        rms > MARKER_FIT.max_median_residual
-    ):  # a wrong unit or label, which loading the scene refuses
-        return scene, None, []
+    if rms > MARKER_FIT.max_median_residual:
+        return scene, None, []  # loading the scene refuses the wrong unit or label
     if not (poor or request.companions if request.register is None else request.register):
         return scene, None, []
     trials, lines = {request.recording.name: own}, []
