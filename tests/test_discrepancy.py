@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from tkamb.io.scene.uncertainty import FLUOROSCOPY_ERROR, SKIN_MARKER_ERROR, UncertaintyTable
 from tkamb.run.claims import peaks
@@ -97,7 +98,12 @@ def test_a_band_with_discrepancy_is_never_negative_and_nan_without_samples():
     samples[:, 1] = np.nan
     discrepancy = Discrepancy(0.0, 1.0, 4.0, 1, 3)
     low, high = band_with_discrepancy(samples, discrepancy, np.full(2, 700.0))
-    assert low[0] == 0.0 and high[0] > 100.0 + 1.64 * 700.0  # Student's t is wider
+    # Student's t of four degrees of freedom, cut off at zero force
+    t = stats.t(4.0, loc=100.0, scale=700.0)
+    for end, share in ((low[0], 0.05), (high[0], 0.95)):
+        expected = t.ppf(t.cdf(0.0) + share * t.sf(0.0))
+        assert end == pytest.approx(expected, rel=0.05, abs=20.0)
+    assert low[0] > 0.0
     assert np.isnan([low[1], high[1]]).all()
     assert np.isnan(band_with_discrepancy(samples[:, 1:], discrepancy, np.full(1, 700.0))).all()
 

@@ -396,7 +396,9 @@ class ReleasedKnee:
             base = forces.tension_in_equilibrium(contact, compliance) - float(
                 compliance @ muscle_wrench
             )
-            share = muscles.share_of_yielding_knee(geometry, base, compliance)
+            touched = {side: condyle.point for side, condyle in contact.condyles.items()}
+            touched = touched if instant.two_condyles else {}
+            share = muscles.share_of_yielding_knee(geometry, base, compliance, touched)
         else:
             points = instant.resultants(coordinates, contact.condyles)
             geometry = replace(geometry, post=instant.post_loads(coordinates, contact.post))

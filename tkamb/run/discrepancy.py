@@ -12,10 +12,11 @@ force is therefore d(t) G(t), with the total force F(t) in body weights and
 over the frames t of a trial of an activity.
 
 m is common to all trials of an activity, b to all frames of a trial. w is correlated over about
-0.1 s. S² is the mean square of the trials' biases, V the mean square of their scatters. All trials
-are of one subject. To include the differences between subjects, a published blind prediction of
-other subjects counts as one more trial. Its root mean square error in body weights is divided by
-G of walking. The square, bias² + scatter², is split into S² and V in the ratio of the trials.
+0.1 s. S² is the mean square of the trials' biases, V the mean square of their scatters, over the
+trials of the activity or, if it has none, over all trials. All trials are of one subject. To
+include the differences between subjects, a published blind prediction of other subjects counts as
+one more trial. Its root mean square error in body weights is divided by G of walking. The square,
+bias² + scatter², is split into S² and V in the ratio of the trials.
 
 With n trials of the activity and their mean bias B, m has the mean n B/(n + 1) and the variance
 S²/2/(n + 1). Then d has the variance
@@ -69,10 +70,10 @@ COLUMNS = {
 class DiscrepancySettings:
     """How the discrepancy is fitted and added to the samples."""
 
-    quantiles: int = 41
+    quantiles: int = 201
     """1: number of quantiles that represent Student's t. More change the ends of a band by less
     than 1 %."""
-    sample_quantiles: int = 100
+    sample_quantiles: int = 60
     """1: number of quantiles that represent the samples. More change the ends of a band by less
     than 1 %."""
     least_load_BW: float = 0.5
@@ -224,7 +225,9 @@ def fitted(errors: Sequence[TrialError], force: str, activity: str | None) -> Di
     chosen = [one for one in errors if one.force == force]
     if not chosen:
         return None
-    activity_biases = [one.bias for one in chosen if one.activity == activity]
+    own = [one for one in chosen if one.activity == activity]
+    activity_biases = [one.bias for one in own]
+    every, chosen = len(chosen), own or chosen
     biases = np.array([one.bias**2 for one in chosen])
     scatters = np.array([one.scatter**2 for one in chosen])
     share = float(biases.sum() / max((biases + scatters).sum(), np.finfo(float).tiny))
@@ -243,7 +246,7 @@ def fitted(errors: Sequence[TrialError], force: str, activity: str | None) -> Di
         deviation=float(np.sqrt(max(0.0, total / (len(chosen) + 1) - inputs))),
         freedom=total**2 / max(uncertain, np.finfo(float).tiny),
         own_trials=len(activity_biases),
-        trials=len(chosen),
+        trials=every,
     )
 
 
@@ -253,7 +256,8 @@ def band_with_discrepancy(
     """Return the band of inputs and discrepancy together, (percents, f), in the samples' unit.
 
     The band belongs to the sum of two independent variables: the force of the samples, and the
-    discrepancy. A negative sum counts as zero.
+    discrepancy. Contacts only push, so the band is that of the sums above zero. It is asymmetric
+    where the force is small.
 
     Args:
         samples: force of each sample, (n, f); NaN in failed frames.
@@ -273,10 +277,14 @@ def band_with_discrepancy(
         axis=0,
         method=QUANTILE_METHOD,
     )
-    every = np.maximum(of_samples[:, None, :] + added[:, None] * load[finite], 0.0)
-    ends[:, finite] = np.percentile(
-        every.reshape(len(of_samples) * len(added), -1), list(percents), axis=0
-    )
+    every = of_samples[:, None, :] + added[:, None] * load[finite]
+    every = np.sort(every.reshape(len(of_samples) * len(added), -1), axis=0)
+    # The sums below zero come first. The quantiles are those of the remaining ones.
+    below = (every < 0.0).sum(axis=0)
+    for end, percent in zip(ends, percents, strict=True):
+        rank = below + (len(every) - 1 - below) * percent / 100.0
+        place = np.clip(np.round(rank).astype(int), 0, len(every) - 1)
+        end[finite] = np.maximum(every[place, np.arange(every.shape[1])], 0.0)
     return ends
 
 
