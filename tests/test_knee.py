@@ -180,7 +180,7 @@ def test_forces_on_the_joints_are_internal(read):
 def test_the_pull_of_the_ligaments_is_the_slope_of_their_energy(read):
     """Without contact the generalised force is minus the slope of the bundles' energy."""
     plain, motion, _ = read
-    toe = [replace(one, law="quadratic-toe", stiffness=2e3) for one in plain.ligaments]
+    toe = [replace(one, law=tkamb.QuadraticToe(stiffness=2e3)) for one in plain.ligaments]
     knee = tkamb.Knee(plain.model, ligaments=toe)
     q, v = motion.q[50].copy(), np.zeros(knee.model.nv)
     tau = -pin.rnea(knee.model, knee.model.createData(), q, v, v, knee.external_forces(q, v))

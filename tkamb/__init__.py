@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from tkamb.contact.registry import contact_model
     from tkamb.io.scene import Scene, load_scene
     from tkamb.knee.knee import Knee
+    from tkamb.knee.ligament_laws import QuadraticToe, TwoLine, ligament_law
     from tkamb.knee.ligaments import Ligament
     from tkamb.knee.load import LinkPoint
     from tkamb.knee.loads import KneeLoads
@@ -40,11 +41,14 @@ __all__ = [
     "LinkPoint",
     "Muscle",
     "PatellarLigament",
+    "QuadraticToe",
     "Results",
     "SagittalWrap",
     "Scene",
+    "TwoLine",
     "__version__",
     "contact_model",
+    "ligament_law",
     "live",
     "load_scene",
     "plot",
@@ -60,6 +64,9 @@ _HOMES = {
     "Knee": "tkamb.knee.knee",
     "KneeLoads": "tkamb.knee.loads",
     "Ligament": "tkamb.knee.ligaments",
+    "QuadraticToe": "tkamb.knee.ligament_laws",
+    "TwoLine": "tkamb.knee.ligament_laws",
+    "ligament_law": "tkamb.knee.ligament_laws",
     "LinkPoint": "tkamb.knee.load",
     "Muscle": "tkamb.knee.muscles",
     "PatellarLigament": "tkamb.knee.muscles",

@@ -31,7 +31,7 @@ model.appendBodyToJoint(joint, pin.Inertia(4.0, np.zeros(3), 0.01 * np.eye(3)), 
 model.addFrame(pin.Frame("femur", joint, 0, pin.SE3.Identity(), pin.FrameType.BODY))
 springs = [  # four horizontal springs in front and behind, N per unit strain
     tkamb.Ligament(f"spring {x:+.2f} {z:+.2f}", ("femur", (0, 0, z)), ("tibia", (x, 0.03, z)),
-                   "quadratic-toe", 2000.0, 0.09)
+                   tkamb.QuadraticToe(stiffness=2000.0), 0.09)
     for x in (-0.1, 0.1) for z in (-0.03, 0.03)
 ]  # fmt: skip
 knee = tkamb.Knee(
