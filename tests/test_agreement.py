@@ -92,7 +92,7 @@ def test_a_probe_of_a_failed_result_evaluates_all_columns():
     model = contact_model("foundation", 1.0)
     state = model.prepare(flat_joint())
     pose = model.press(state, 1000.0, knee_pose(np.zeros(6))).pose
-    failed = ContactResult.failed(state, pose, "no result")
+    failed = ContactResult.out_of_range(state, pose, "no result")
     assert set(model.probe(state).seen(failed).condyles) == {"medial", "lateral"}
 
 

@@ -135,7 +135,7 @@ def test_the_approach_is_that_of_the_pose(state):
     assert result.approach == 0.0
     deeper = replace(result, pose=state.pair.pose_at_approach(POSE, 2e-4))
     assert deeper.approach == pytest.approx(2e-4, abs=1e-15)
-    assert np.isnan(ContactResult.failed(state, POSE, "why").approach)
+    assert np.isnan(ContactResult.out_of_range(state, POSE, "why").approach)
 
 
 def test_stored_compliance_changes_no_result(state):
