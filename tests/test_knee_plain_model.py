@@ -106,7 +106,7 @@ def test_equilibrium_moves_the_knee_of_a_model_without_a_patella(read):
     knee = without_patella(read[0])
     q, v, a, external = state_of(read, 60)
     equilibrium = knee.equilibrium(q, v, a, external)
-    assert not equilibrium.problem
+    assert not equilibrium.failed
     assert knee.coordinates(equilibrium.q) == pytest.approx(equilibrium.coordinates, abs=1e-10)
     assert equilibrium.q[:7] == pytest.approx(q[:7])
     forces = knee.external_forces(equilibrium.q, v, equilibrium.loads.tensions)

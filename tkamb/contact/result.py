@@ -384,16 +384,6 @@ class WarmStart:
         """Return a warm start from the fields of a result."""
         return WarmStart(result.pair, result.pose, result.points, result.pressure, result.gap)
 
-    @property
-    def failed(self) -> bool:
-        """Whether the result has no numbers, because the model is out of its range."""
-        return self.status is ContactStatus.OUT_OF_RANGE
-
-    @property
-    def reason(self) -> str:
-        """Why the status is not OK, in a sentence; empty: it is OK."""
-        return "" if self.status is ContactStatus.OK else "; ".join(self.flags)
-
     @cached_property
     def approach(self) -> float:
         """m, travel along -y since first touch; NaN if the contact failed."""

@@ -11,6 +11,7 @@ import pinocchio as pin
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, Array, mirrored_pose, transform
 from tkamb.knee.parts import mirrored_surface
+from tkamb.knee.pressed import contact_of_equations
 
 if TYPE_CHECKING:
     from tkamb.contact.result import ContactResult
@@ -72,11 +73,12 @@ def show_knee(
     tree = window[root][node] if root else window[node]
     tree.delete()
     data = knee.create_data()
-    kinematics = knee.at(q, data)
+    kinematics = knee._kinematics(data, q)
     insert = data.data.oMi[knee.bridge.insert.joint] * knee.bridge.insert.placement
     world = insert.homogeneous
     if contact is None and knee.contact is not None:
         contact = knee.evaluate(q)
+    contact = None if contact is None else contact_of_equations(contact, knee.left)
     femur = kinematics.pose if contact is None else contact.pose
 
     def in_world(points: Array) -> Array:
@@ -87,7 +89,7 @@ def show_knee(
     femur_in_world = world @ to_side(femur)
     _solid(tree["femoral"], knee.femoral, femur_in_world, knee.left, "femoral", opacity)
     _solid(tree["insert"], knee.insert, world, knee.left, "insert", 0.6)
-    poses, patella = knee.link_poses(q, femur, data)
+    poses, patella = knee._drawn_links(q, femur, data)
     if patella:
         _solid(
             tree["patella"],
@@ -101,7 +103,7 @@ def show_knee(
         if {bundle.proximal.link, bundle.distal.link} <= set(poses):
             ends = np.array(bundle.ends(poses))
             _strand(tree["ligaments"][bundle.name], in_world(ends), LIGAMENT)
-    for name, path in knee.extensor_paths(poses).items():
+    for name, path in knee._extensor_paths(poses).items():
         _strand(tree["extensor"][name], in_world(path), MUSCLE)
     if contact is not None and np.isfinite(contact.pressure).all():
         _map(tree["pressure"], contact, knee.contact.state.triangles, in_world, peak)  # type: ignore[union-attr]

@@ -216,7 +216,7 @@ def _check_near(case: Case, knee: Knee, poses: Array) -> None:
         return
     nearest: list[float] = []
     for k in (len(poses) // 2, 0, len(poses) - 1):
-        nearest.append(nearest_gap(knee.query.at(poses[k])))
+        nearest.append(nearest_gap(knee._query.at(poses[k])))
         if abs(nearest[-1]) <= CONTACT_POINT.max_gap:
             return
     gap = min(nearest, key=abs)

@@ -351,8 +351,10 @@ def bench_of_knee(knee: Knee, q: Any) -> LiveKnee:
     if knee.contact is None or knee.femoral is None or knee.insert is None:
         raise InputError("has no contact model", "Knee", "give contact= and implant=")
     placement = insert_placement(knee.insert)
-    data = knee.create_data_for_kinematics()
-    poses = np.array([knee.at(one, data).pose for one in np.atleast_2d(np.asarray(q, float))])
+    data = knee._kinematic_data()
+    poses = np.array(
+        [knee._kinematics(data, one).pose for one in np.atleast_2d(np.asarray(q, float))]
+    )
     coordinates = knee_coordinates(placement @ poses)
     session = Path(tempfile.mkdtemp(prefix="tkamb-live-"))
     try:
