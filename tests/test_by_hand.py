@@ -137,7 +137,7 @@ def test_bundles_follow_the_published_toe_law():
 def test_the_source_s_rule_divides_by_the_overlap_of_the_undeformed_bodies():
     """A sphere that penetrates the flat insert by d has the contact area pi (2 R d - d²)."""
     radius, load = 20e-3, 700.0
-    model = contact_model("lattice-linear", 1.0, pressure_rule="source", cache=False)
+    model = contact_model("lattice-linear", resolution=1e-3, pressure_rule="source", cache=False)
     bodies = pair(
         sphere_cap(radius), box_insert(20e-3, 8e-3, 20e-3), material("polyethylene-linear")
     )

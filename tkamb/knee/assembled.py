@@ -17,7 +17,7 @@ from tkamb.geometry.frames import (
     mirrored_pose,
     sagittal_pose,
 )
-from tkamb.knee.anatomy import find_anatomy
+from tkamb.knee.anatomy import check_not_exchanged, find_anatomy
 from tkamb.knee.canonical import Bridge, CanonicalChain, KneePose, se3
 from tkamb.knee.load import PointForces
 from tkamb.knee.muscles import Muscle, checked_tensions, tension_lines
@@ -40,6 +40,21 @@ if TYPE_CHECKING:
     from tkamb.knee.extensor import ExtensorLines
     from tkamb.knee.ligaments import Ligament
     from tkamb.knee.patella import PatellaState
+
+
+@dataclass(frozen=True)
+class KneeCheckSettings:
+    """Checks of a configuration."""
+
+    unit_tolerance: float = 1e-6
+    """1: largest error of a quaternion's norm. Chosen because an error of this size changes a force
+    by a millionth."""
+    max_distance: float = 0.1
+    """m: largest distance of the components. Chosen because the ligaments of a knee tear at 20 mm
+    of distraction."""
+
+
+KNEE_CHECK = KneeCheckSettings()
 
 PATELLAR_LIGAMENT = "patellar_ligament"
 """Name of the patellar ligament among the tensions."""
@@ -69,6 +84,10 @@ class KneeData:
     start: "Guess | None" = None
     knee: str = ""
 
+    def __repr__(self) -> str:
+        """Return the knee that made the data."""
+        return f"<tkamb.KneeData of {self.knee}>"
+
 
 class AssembledKnee:
     """The parts of a knee on a Pinocchio model, and their poses; `tkamb.Knee` adds the loads.
@@ -87,7 +106,7 @@ class AssembledKnee:
         contact: "ContactModel | KneeContact | str | None" = None,
         friction: float = 0.0,
         muscles: Iterable[Muscle] = (),
-        frames: Mapping[str, str] | None = None,
+        frames: Mapping[str, str | None] | None = None,
         joints: Sequence[str] = (),
         cache: bool = False,
     ) -> None:
@@ -98,8 +117,9 @@ class AssembledKnee:
         self.model, self.side, self.friction = model, side, float(friction)
         self.implant, is_left = implant or Implant(), side == "left"
         self.anatomy = find_anatomy(
-            model, frames or {}, joints, extensor.plane if extensor else None
+            model, frames or {}, joints, _placement(extensor.plane) if extensor else None
         )
+        check_not_exchanged(self.anatomy)
         surfaces = surfaces_of(self.implant, is_left, contact is not None, extensor is not None)
         insert, insert_surface = placed_insert(self.anatomy, self.implant, surfaces.insert, is_left)
         self._surfaces = replace(surfaces, insert=insert_surface)
@@ -255,7 +275,7 @@ class AssembledKnee:
         generalised force by -J^T K J per displacement.
         """
         data = self._data(data, contact=False)
-        return self.bridge.relative_jacobian(data.data, self._check(q, "q", self.model.nq))
+        return self.bridge.relative_jacobian(data.data, self._check_q(q))
 
     def _drawn_links(self, q: Array, femur: Array, data: KneeData) -> tuple[dict[str, Array], bool]:
         """Return link -> pose (4, 4) in the insert frame. A left knee is mirrored to a right one.
@@ -299,8 +319,44 @@ class AssembledKnee:
             raise InputError(f"{name} has the shape {array.shape}", "Knee", f"give ({size},)")
         return array
 
-    def _kinematics(self, data: KneeData, q: Array, v: Array | None = None) -> KneePose:
+    def _check_q(self, q: Array) -> Array:
+        """Return q after a check of its size, and of its quaternions."""
         q = self._check(q, "q", self.model.nq)
+        if not pin.isNormalized(self.model, q, KNEE_CHECK.unit_tolerance) and np.isfinite(q).all():
+            unit = q.copy()
+            pin.normalize(self.model, unit)
+            error = float(np.abs(q - unit).max())
+            raise InputError(
+                f"q is not normalised: a component of a quaternion is off by {error:.3g}",
+                "Knee",
+                "call pin.normalize(model, q)",
+            )
+        return q
+
+    def _check_place(self, pose: Array) -> None:
+        """Raise an error if the components are nowhere near each other.
+
+        Raises:
+            ComputationError: the femoral component is far from the insert, or below it.
+        """
+        if self.femoral is None or self.insert is None or not np.isfinite(pose).all():
+            return
+        (low, high), bounds = self.insert.bounds, self.femoral.bounds
+        centre = pose[:3, :3] @ bounds.mean(axis=0) + pose[:3, 3]
+        apart = float(np.linalg.norm(np.maximum(np.maximum(low - centre, centre - high), 0.0)))
+        apart -= 0.5 * float(np.linalg.norm(bounds[1] - bounds[0]))
+        if apart > KNEE_CHECK.max_distance:
+            words = f"the femoral component is {apart:.3g} m or more away from the insert"
+        elif centre[1] < low[1]:
+            words = (
+                f"the femoral component lies {low[1] - centre[1]:.3g} m below the insert's bottom"
+            )
+        else:
+            return
+        raise ComputationError(words, "q", "check q and the frames femur, tibia, femoral, insert")
+
+    def _kinematics(self, data: KneeData, q: Array, v: Array | None = None) -> KneePose:
+        q = self._check_q(q)
         if v is None:
             pin.forwardKinematics(self.model, data.data, q)
         else:
@@ -369,6 +425,13 @@ class AssembledKnee:
             for joint, force in self._lines[name].forces(data.data, tensions[name]):
                 total[joint] += force
         return pin.StdVec_Force(total)
+
+
+def _placement(pose: Any) -> pin.SE3 | None:
+    """Return a pose, `pin.SE3` or (4, 4), as `pin.SE3`."""
+    if pose is None or isinstance(pose, pin.SE3):
+        return pose
+    return se3(np.asarray(pose, float))
 
 
 def _identity(knee: AssembledKnee) -> str:

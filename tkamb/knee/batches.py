@@ -9,6 +9,7 @@ from tkamb.contact.result import ContactStatus
 from tkamb.errors import InputError
 from tkamb.geometry.frames import SIDES, Array
 from tkamb.knee.pressed import KneeContactResult, contact_of_user
+from tkamb.units import MEGAPASCAL
 
 if TYPE_CHECKING:
     from tkamb.knee.assembled import KneeData
@@ -39,6 +40,19 @@ class PressBatch:
     pose: Array
     pressure: Array
     derivatives: "tuple[PressDerivatives, ...]" = ()
+
+    def __repr__(self) -> str:
+        """Return the number of poses, of failures, and the largest peak pressure."""
+        failed = sum(one.failed for one in self.results)
+        peak = np.nanmax(self.peak_pressure, initial=0.0) / MEGAPASCAL
+        return (
+            f"<tkamb.PressBatch: {len(self.results)} poses, {failed} failed; peak {peak:.1f} MPa>"
+        )
+
+    @property
+    def failed(self) -> Array:
+        """Whether each press failed, shape (n,)."""
+        return np.array([one.failed for one in self.results], bool)
 
     @property
     def status(self) -> tuple[ContactStatus, ...]:

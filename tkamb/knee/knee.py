@@ -122,13 +122,27 @@ class Knee(AssembledKnee):
             another knee with the same implant; None: no contact.
         friction: Coulomb coefficient of the femorotibial contact.
         muscles: straight lines of given tension between any frames of the model.
-        frames: part of the knee -> name of its frame in the model.
+        frames: part of the knee -> name of its frame in the model; None: the part's default. A
+            joint's frame is not taken for a part unless it is named here.
         joints: expected names of the joints between tibia and femur; empty: no check.
         cache: whether a lattice stores its prepared operators on disk for later runs.
 
     Raises:
         InputError: the arguments do not fit together.
     """
+
+    def __repr__(self) -> str:
+        """Return side, model, contact and lines in three lines."""
+        contact = "no contact"
+        if self.contact is not None:
+            model = self.contact.model
+            contact = f"{model.name} at {getattr(model, 'resolution', 0.0) / MILLIMETRE:g} mm"
+        lines = f"{len(self.ligaments)} ligaments, {len(self._lines)} muscles"
+        return (
+            f"<tkamb.Knee: {self.side} knee on '{self.model.name}' (nq {self.model.nq}, nv "
+            f"{self.model.nv})\n  {contact}, friction {self.friction:g}\n  {lines}, "
+            f"{'no ' if self.extensor is None else ''}extensor mechanism>"
+        )
 
     def external_forces(
         self,
@@ -164,6 +178,7 @@ class Knee(AssembledKnee):
 
             return forces_of_all(self, q, v, tensions, data)
         kinematics = self._kinematics(data, q, v)
+        self._check_place(kinematics.pose)
         on_insert = np.zeros(6)
         if self.contact is not None:
             contact = self._contact_at(data, kinematics)
@@ -427,6 +442,7 @@ class Knee(AssembledKnee):
         """
         data = self._data(data, contact=False)
         instant = self._instant(q, v, a, fext, tensions, data)
+        self._check_place(knee_pose(instant.coordinates))
         geometry, points = instant.geometry(), NO_CONTACT
         if contact is not None:
             from tkamb.contact.model import condyle_wrenches
@@ -516,6 +532,7 @@ class Knee(AssembledKnee):
 
         contact, data = self._need_contact(), self._data(data, contact=False)
         pose = self._kinematics(data, q).pose
+        self._check_place(pose)
         result = contact.model.evaluate(contact.state, pose, data.start)
         if not result.failed:
             data.start = result
@@ -655,7 +672,7 @@ class Knee(AssembledKnee):
             InputError: an argument has the wrong size, or a muscle is unknown.
         """
         data = self._data(data, contact=False)
-        q = self._check(q, "q", self.model.nq)
+        q = self._check_q(q)
         v, a = self._check(v, "v", self.model.nv), self._check(a, "a", self.model.nv)
         self._check_fext(fext)
         muscle_tensions = self._tensions(tensions)

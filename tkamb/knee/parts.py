@@ -90,15 +90,16 @@ class Extensor:
         quadriceps: muscle from the femur to the patella.
         patellar_ligament: line from the patella to the tibia. Its `length` is required if q does
             not give the pose of the patella.
-        plane: pose of the plane's frame in the frame "femur"; None: the placement of the joint
-            "patella_ap", or the frame "femur" if the model has no such joint.
+        plane: pose of the plane's frame in the frame "femur", `pin.SE3` or (4, 4); None: the
+            placement of the joint "patella_ap", or the frame "femur" if the model has no such
+            joint.
         solved: whether `Knee.equilibrium` solves the patella of the model again when the femur
             moves. False: the patella moves with the femur.
     """
 
     quadriceps: Muscle
     patellar_ligament: PatellarLigament
-    plane: "pin.SE3 | None" = None
+    plane: "pin.SE3 | Array | None" = None
     solved: bool = False
 
 

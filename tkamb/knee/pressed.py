@@ -3,8 +3,6 @@
 from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
-import pinocchio as pin
-
 from tkamb.contact.result import CondyleContact, ContactResult
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, mirrored_pose
@@ -73,8 +71,3 @@ def contact_of_equations(result: ContactResult, left: bool) -> ContactResult:
         "contact",
         "give the result of press or evaluate of this knee",
     )
-
-
-def of_user_pose(pose: Any) -> pin.SE3:
-    """Return a pose, given as `pin.SE3` or (4, 4), as `pin.SE3`."""
-    return pose if isinstance(pose, pin.SE3) else se3(pose)

@@ -194,7 +194,9 @@ def _knee(case: Case, shared: SharedState | None, contact: "KneeContact | None")
             material = given_material(scene.insert_material)
             pair = ContactPair(case.femoral, case.insert, material, insert.bearing)
             pair.__dict__["split"] = case.split  # computed once for case and pair
-        model = contact_model(table.model, table.resolution_mm, **table.options)
+        model = contact_model(
+            table.model, resolution=table.resolution_mm * MILLIMETRE, **table.options
+        )
         contact = KneeContact(model, pair, friction)
     if contact is not None:
         pair = contact.pair

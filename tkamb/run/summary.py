@@ -178,7 +178,7 @@ def _tolerances(table: ContactTable) -> dict[str, float]:
     from tkamb.contact.lattice.model import CellContact
     from tkamb.contact.registry import contact_model
 
-    model = contact_model(table.model, table.resolution_mm, **table.options)
+    model = contact_model(table.model, resolution=table.resolution_mm * MILLIMETRE, **table.options)
     assert isinstance(model, CellContact)
     settings = model.settings
     return {"force": settings.force_tolerance, "gap": settings.gap_tolerance}
