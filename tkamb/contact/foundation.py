@@ -5,7 +5,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from tkamb.contact.flags import narrow_flags
+from tkamb.contact.flags import narrow_flags, unsupported_flags
 from tkamb.contact.materials import Material
 from tkamb.contact.model import CondyleWrench, ContactModel, ProbedContact
 from tkamb.contact.pressing import PRESS, press_by_search
@@ -52,7 +52,7 @@ OVER_THE_EDGE = (
 WIDEST_EDGE = NEAR
 """m: upper limit of the range of gaps in which `FoundationProbe.smoothed` counts a column partly.
 The range is the change of the gap across the column."""
-SUMS = 46
+SUMS = 70
 """Number of sums over the columns of one condyle; see `_add_up`."""
 
 
@@ -118,10 +118,12 @@ class ElasticFoundation(ContactModel):
             return ContactResult.failed(state, pose, TOO_DEEP if full_depth else OVER_THE_EDGE)
         pressure = layer_pressure(self.law, state.pair.material, strain)
         medial = medial_points(samples.points, pose, state.pair.split)
-        flags = narrow_flags(
-            samples.triangles, pressure > 0, {"medial": medial, "lateral": ~medial}, "columns"
+        sides = {"medial": medial, "lateral": ~medial}
+        flags = (
+            *unsupported_flags(state.pair.insert, samples.points, pressure, sides),
+            *narrow_flags(samples.triangles, pressure > 0, sides, "columns"),
         )
-        return ContactResult.of(state, pose, pressure, gap, medial=medial, flags=tuple(flags))
+        return ContactResult.of(state, pose, pressure, gap, medial=medial, flags=flags)
 
     def press(
         self, state: SampledContact, load: float, pose: Array, guess: Guess | None = None
@@ -295,9 +297,10 @@ class FoundationProbe:
         condyles = {}
         for side, sums in self._sums(samples, gap, femoral_normal, force, rate, pose).items():
             if sums[0] > 0.0:
-                condyles[side] = CondyleWrench(
-                    -sums[4:10], sums[1:4] / sums[0], sums[10:].reshape(6, 6)
-                )
+                stiffness, centre = sums[10:46].reshape(6, 6), sums[1:4] / sums[0]
+                # The centre is sum(x F) / sum(F) over the columns.
+                slope = sums[46:64].reshape(3, 6) - np.outer(centre, sums[64:])
+                condyles[side] = CondyleWrench(-sums[4:10], centre, stiffness, slope / sums[0])
         return ProbedContact(condyles, tangent=True)
 
     def smoothed(self, pose: Array, contact: ProbedContact) -> ProbedContact:
@@ -321,7 +324,7 @@ class FoundationProbe:
         rate = self._rate(samples, gap) * share
         sums = self._sums(samples, gap, normals, np.zeros_like(gap), rate, pose)
         condyles = {
-            side: replace(condyle, stiffness=sums[side][10:].reshape(6, 6))
+            side: replace(condyle, stiffness=sums[side][10:46].reshape(6, 6))
             for side, condyle in contact.condyles.items()
         }
         return replace(contact, condyles=condyles)
@@ -377,7 +380,8 @@ def _add_up(
         medial: (n,) whether a column belongs to the medial condyle.
         sums: (2, `SUMS`) output for medial and lateral, to which the columns are added: force (N),
             force times point (3,) N·m, wrench on the femoral component (6,), stiffness of the
-            wrench on the insert (6, 6).
+            wrench on the insert (6, 6), and of force times point (3, 6) and force (6,), by a
+            displacement.
     """
     push, met = np.empty(6), np.empty(6)
     for n in range(len(points)):
@@ -396,3 +400,9 @@ def _add_up(
             side_sums[4 + i] += force[n] * push[i]
             for j in range(6):
                 side_sums[10 + 6 * i + j] += push[i] * met[j] * (rate[n] / cosine)
+        for j in range(6):
+            # A displacement changes the force of the column by -rate m / (m . n).
+            change = -met[j] * (rate[n] / cosine)
+            side_sums[64 + j] += change
+            for i in range(3):
+                side_sums[46 + 6 * i + j] += points[n, i] * change

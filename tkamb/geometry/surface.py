@@ -12,6 +12,7 @@ from tkamb.geometry.topology import Ragged, edge_use, same_places
 if TYPE_CHECKING:
     import trimesh
 
+    from tkamb.geometry.defects import Defect
     from tkamb.geometry.nearest import NearestPoints, TriangleTree
     from tkamb.geometry.rays import RayCaster
     from tkamb.geometry.winding import WindingNumber
@@ -208,6 +209,13 @@ class Surface:
         from tkamb.geometry.winding import WindingNumber
 
         return WindingNumber(self)
+
+    @cached_property
+    def defects(self) -> "tuple[Defect, ...]":
+        """The openings, spikes, noise and steps of the surface."""
+        from tkamb.geometry.defects import defects_of
+
+        return defects_of(self)
 
     @cached_property
     def volume(self) -> float:

@@ -348,6 +348,9 @@ def _differentiate(
 def _frames(sampled: Array, source: MotionTable, cycle: Cycle | None) -> Array:
     if cycle:
         return cycle.frames(sampled, source.frames)
+    if len(sampled) < 2:
+        hint = "give two rows or more: rates need them"
+        raise InputError(f"holds {len(sampled)} row of motion", source.file, hint)
     start, end = source.interval_s or (sampled[0], sampled[-1])
     inside = sampled[(sampled >= start - 1e-9) & (sampled <= end + 1e-9)]
     if len(inside) < 2 or start < sampled[0] - 1e-9 or end > sampled[-1] + 1e-9:

@@ -1,6 +1,7 @@
 """Read recorded tables: `.csv`, OpenSim `.sto` and `.mot`, and markers of `.trc` and `.c3d`."""
 
 import contextlib
+import logging
 import math
 import re
 from collections import Counter
@@ -28,6 +29,7 @@ class TableValueSettings:
 
 
 TABLE_VALUE = TableValueSettings()
+_log = logging.getLogger(__name__)
 
 TRC_LABELS = 3
 """Index of the line of a `.trc` with the markers' labels."""
@@ -38,7 +40,7 @@ _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?")
 _NUMBER_CHARACTERS = "0123456789+-.eE "
 """Characters of plain decimal numbers."""
 _INFINITE = re.compile(r"[+-]?inf(inity)?")
-_COMMA_NUMBER = re.compile(r"[+-]?[0-9]+,[0-9]+")
+_COMMA_NUMBER = re.compile(r"[+-]?[0-9]*,[0-9]+([eE][+-]?[0-9]{1,3})?")
 STATED_DEGREES = {"yes": True, "true": True, "1": True, "no": False, "false": False, "0": False}
 """Words after `inDegrees=` in a storage file -> whether angles are in degrees."""
 
@@ -187,28 +189,55 @@ def with_unit(table: Table, length_unit: str | None) -> Table:
 def read_csv(path: Path) -> Table:
     """Read comma-separated values with one header row.
 
-    Empty lines and lines that begin with # are skipped. Empty cells after the last named column are
-    skipped, too, because some programs end every line with a comma.
+    Semicolons or tabs may separate the cells, with points or commas in the numbers; a notice
+    says so. Empty lines and lines that begin with # are skipped. Empty cells after the last named
+    column are skipped, too, because some programs end every line with a comma.
     """
-    lines = read_lines(path)
-    rows = [
-        (number, line.replace('"', "").split(","))
-        for number, line in enumerate(lines, 1)
+    lines = [
+        (number, line.replace('"', ""))
+        for number, line in enumerate(read_lines(path), 1)
         if line.strip() and not line.lstrip().startswith("#")
     ]
-    if not rows:
+    if not lines:
         raise InputError("is empty", path, "export the recording again")
+    # A header may contain commas, as in "Force, N"; a separator is in every line.
+    sign = next((one for one in SEPARATORS if all(one in line for _, line in lines)), ",")
+    rows = [(number, line.split(sign)) for number, line in lines]
+    rows, notices = (rows, ()) if sign == "," else _with_points(rows, sign, path)
     names = [name.strip() for name in rows[0][1]]
-    for sign, word in ((";", "semicolons"), ("\t", "tabs")):
-        if len(names) == 1 and sign in names[0]:
-            hint = "save it with commas between the cells and points in the numbers"
-            raise InputError(f"has {word} between its cells, not commas", path, hint)
     body = [
         (number, cells if any(map(str.strip, cells[len(names) :])) else cells[: len(names)])
         for number, cells in rows[1:]
     ]
+    for notice in notices:
+        _log.warning("%s: %s", path, notice)
     columns, equal = _columns(path, names, body)
-    return Table(path, columns, equal=equal, notices=_equal_notices(equal))
+    return Table(path, columns, equal=equal, notices=(*notices, *_equal_notices(equal)))
+
+
+SEPARATORS = {";": "semicolons", "\t": "tabs"}
+
+
+def _with_points(
+    rows: list[tuple[int, list[str]]], sign: str, path: Path
+) -> tuple[list[tuple[int, list[str]]], tuple[str, ...]]:
+    """Return rows with points in the numbers, and a notice on the separator.
+
+    Raises:
+        InputError: some numbers have a comma and others a point.
+    """
+    cells = [cell.strip() for _, row in rows[1:] for cell in row]
+    comma = next((cell for cell in cells if _COMMA_NUMBER.fullmatch(cell)), None)
+    point = next((cell for cell in cells if "." in cell and _NUMBER.fullmatch(cell)), None)
+    if comma and point:
+        what = f"has numbers with a comma ('{comma}') and others with a point ('{point}')"
+        raise InputError(what, path, "export it with one decimal sign")
+    words = f"has {SEPARATORS[sign]} between its cells"
+    if not comma:
+        return rows, (f"{words}: read so",)
+    body = [(number, [cell.replace(",", ".") for cell in row]) for number, row in rows[1:]]
+    notice = f"{words} and commas in its numbers: read so, '{comma}' as {comma.replace(',', '.')}"
+    return [rows[0], *body], (notice,)
 
 
 def read_storage(path: Path) -> Table:
