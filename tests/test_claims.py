@@ -34,7 +34,7 @@ def numbers_of(text: str) -> list[float]:
 
 
 def truth_rows() -> Truth:
-    """Return (trial, whether it has all muscles) -> force -> numbers, from the tables of truth.md."""
+    """Return (trial, whether it has all muscles) -> force -> numbers, from truth.md."""
     text = (ROOT / "docs" / "truth.md").read_text(encoding="utf-8")
     rows, trial = Truth(), ""
     for line in text.split("**With the quadriceps")[0].splitlines():

@@ -16,7 +16,8 @@ from tkamb.errors import InputError
 from tkamb.io.claim import settle
 from tkamb.io.scene import Scene
 from tkamb.io.vtk import write_hexahedra
-from tkamb.run.results_folder import read_results, verify_results
+from tkamb.run.reproduction import verify_results
+from tkamb.run.results_folder import read_results
 from tkamb.studies.kept_rows import KeptRows
 
 MOST = 400

@@ -90,9 +90,8 @@ def split_of(columns: Mapping[str, Any]) -> Split:
 def _share(columns: Mapping[str, Any], estimate: str) -> Array:
     """Return medial / (medial + lateral) (f,) of an estimate; NaN without load."""
     names = [ESTIMATES[estimate].replace("<side>", side) for side in FORCES[1:]]
-    if not all(name in columns for name in names):
-        return np.full(len(columns["status"]), np.nan)
-    medial, lateral = (np.asarray(columns[name], float) for name in names)
+    nothing = np.full(len(columns["status"]), np.nan)  # a knee of one condyle has one column
+    medial, lateral = (np.asarray(columns.get(name, nothing), float) for name in names)
     unknown = np.isnan(medial) & np.isnan(lateral)
     medial, lateral = np.nan_to_num(medial), np.nan_to_num(lateral)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -1,6 +1,7 @@
 """A press of two meshes at a given pose with a given load (`tkamb press`)."""
 
 import math
+import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -410,7 +411,7 @@ def load_pair(
     """Return femoral component, insert and pose_femoral_in_insert (4, 4); see `press_meshes`."""
     rotation = axes_rotation(axes)
     femoral_pose = mesh_pose(pose, units, rotation)
-    if Path(femoral).is_file() and Path(insert).is_file():  # `load_surface` names a missing file
+    if os.path.isfile(femoral) and os.path.isfile(insert):  # `load_surface` names a missing file
         check_same_space(femoral, insert)
     femoral_surface = load_surface(femoral, units, axes, name="femoral")
     insert_surface = load_surface(insert, units, axes, name="insert", closed=True)

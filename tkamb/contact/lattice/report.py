@@ -71,7 +71,8 @@ def unresolved_flags(state: LatticeState, result: ContactResult) -> tuple[str, .
     }
     femoral, spacing = state.problem.femoral, state.lattice.spacing
     narrow = narrow_flags(state.surface.triangles, result.pressure > 0, sides)
-    if any(MESH_DEFECT in flag for flag in result.flags):  # finer cells do not help against it
+    # Finer cells do not help against a rough surface; an opening says nothing about their size.
+    if any(MESH_DEFECT in flag and "opening" not in flag for flag in result.flags):
         narrow = iter(())
     return (
         *narrow,

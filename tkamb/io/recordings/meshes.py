@@ -166,8 +166,11 @@ def space_of(path: str | Path) -> str | None:
 
     Headers are that of STL, comments of PLY and OBJ, and comments and field data (text) of VTP.
     """
-    with open(path, "rb") as file:
-        head = file.read(MESH_FILE.header_bytes)
+    try:
+        with open(path, "rb") as file:
+            head = file.read(MESH_FILE.header_bytes)
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", path) from error
     if Path(path).suffix.lower() == ".stl":
         head = head.split(b"\n")[0][:80]
     if (array := _SPACE_ARRAY.search(head)) is not None:  # a text array holds character codes

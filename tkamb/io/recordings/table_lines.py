@@ -10,7 +10,8 @@ from pathlib import Path
 
 from tkamb.files import BYTE_ORDER_MARKS, FILE_LIMITS, read_bytes
 
-SEPARATORS = {",": "commas", ";": "semicolons"}
+SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
+"""Separator of cells -> its name in notices."""
 
 
 def read_lines(path: Path) -> list[str]:
@@ -45,8 +46,9 @@ def tab_separated(lines: Sequence[str], header: int) -> tuple[list[str], list[st
         result = [line.replace('"', "") for line in result]
         notices.append("has quotes around its cells; they are left out")
     names = result[header] if header < len(result) else ""
-    for separator, word in SEPARATORS.items():
+    for separator in (",", ";"):
         if separator in names and "\t" not in names.strip():
+            word = SEPARATORS[separator]
             result = [line.replace("\t", " ").replace(separator, "\t") for line in result]
             notices.append(f"has {word} between its cells, and is read so")
             break

@@ -1,7 +1,6 @@
 """Read recorded tables: `.csv`, OpenSim `.sto` and `.mot`, and markers of `.trc` and `.c3d`."""
 
 import contextlib
-import logging
 import math
 import re
 from collections import Counter
@@ -13,7 +12,7 @@ import numpy as np
 
 from tkamb.errors import InputError, names_near
 from tkamb.geometry.frames import Array
-from tkamb.io.recordings.table_lines import read_lines, tab_separated
+from tkamb.io.recordings.table_lines import SEPARATORS, read_lines, tab_separated
 from tkamb.io.recordings.unit_words import GivenUnits, metres
 from tkamb.units import LENGTH
 
@@ -29,7 +28,6 @@ class TableValueSettings:
 
 
 TABLE_VALUE = TableValueSettings()
-_log = logging.getLogger(__name__)
 
 TRC_LABELS = 3
 """Index of the line of a `.trc` with the markers' labels."""
@@ -201,7 +199,7 @@ def read_csv(path: Path) -> Table:
     if not lines:
         raise InputError("is empty", path, "export the recording again")
     # A header may contain commas, as in "Force, N"; a separator is in every line.
-    sign = next((one for one in SEPARATORS if all(one in line for _, line in lines)), ",")
+    sign = next((one for one in (";", "\t") if all(one in line for _, line in lines)), ",")
     rows = [(number, line.split(sign)) for number, line in lines]
     rows, notices = (rows, ()) if sign == "," else _with_points(rows, sign, path)
     names = [name.strip() for name in rows[0][1]]
@@ -209,13 +207,8 @@ def read_csv(path: Path) -> Table:
         (number, cells if any(map(str.strip, cells[len(names) :])) else cells[: len(names)])
         for number, cells in rows[1:]
     ]
-    for notice in notices:
-        _log.warning("%s: %s", path, notice)
     columns, equal = _columns(path, names, body)
     return Table(path, columns, equal=equal, notices=(*notices, *_equal_notices(equal)))
-
-
-SEPARATORS = {";": "semicolons", "\t": "tabs"}
 
 
 def _with_points(

@@ -95,7 +95,7 @@ class Case:
     @property
     def remarks(self) -> tuple[str, ...]:
         """Notices on the recordings: how they were read, and what of them is not used."""
-        parts = (self.motion, self.tibia, self.ground, self.measured)
+        parts = (self.motion, self.tibia, self.ground, self.measured, self.emg)
         remarks = [remark for part in parts if part is not None for remark in part.remarks]
         return tuple(dict.fromkeys(remarks))
 
