@@ -1,6 +1,8 @@
 """What a `tkamb.Knee` takes and returns: frames of the user's knee, and traps that are refused."""
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -14,6 +16,8 @@ from tkamb.contact.result import ContactStatus
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import mirrored_pose
 from tkamb.knee.canonical import mirrored_spatial
+
+ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
@@ -228,6 +232,16 @@ def test_a_repr_is_short(read):
     batch = knee.press(motion.q[60:62], 500.0)
     for one in (knee, equilibrium, loads, pressed, batch, knee.create_data(), knee.ligaments[0]):
         assert len(repr(one).splitlines()) <= 6 and len(repr(one)) <= 600, repr(one)
+
+
+def test_the_page_on_stable_names_lists_what_is_public():
+    page = (ROOT / "docs" / "stable.md").read_text(encoding="utf-8")
+    for owner, names in (
+        ("`tkamb`", [name for name in tkamb.__all__ if not name.startswith("_")]),
+        ("`tkamb.Knee`", [name for name in dir(tkamb.Knee) if not name.startswith("_")]),
+    ):
+        (row,) = [line for line in page.splitlines() if line.startswith(f"| names of {owner}: ")]
+        assert re.findall(r"`(\w+)`", row.split(":", 1)[1]) == sorted(names)
 
 
 def test_internals_are_private(read):

@@ -83,7 +83,7 @@ _HOMES = {
     "simulate": "tkamb.run.simulation",
 }
 
-__version__ = "0.2.0"
+__version__ = "1.0.0rc1"
 
 
 @lru_cache(maxsize=4)

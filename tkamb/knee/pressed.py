@@ -32,7 +32,7 @@ class KneeContactResult(ContactResult):
     left: bool = field(kw_only=True)
 
     @property
-    def approach(self) -> float:  # type: ignore[override]
+    def approach(self) -> float:
         """m, travel along -y since first touch; 0 when apart, NaN when out of range."""
         return self.of_right_knee.approach
 
