@@ -10,7 +10,7 @@ PACKAGE = Path(__file__).parents[1] / "tkamb"
 
 ORDER = ("geometry", "contact", "knee", "io", "run", "studies", "show", "commands")
 """Folders from the lowest to the highest. Each imports only from lower ones and itself."""
-SERVES_ALL = {"errors", "files", "units"}
+SERVES_ALL = {"errors", "files", "settings", "units"}
 """Modules that every folder may import."""
 ON_TOP = {"__init__", "__main__", "cli", "crocoddyl", "testing"}
 """Modules that may import every folder."""

@@ -12,6 +12,7 @@ import tkamb
 from knee_bodies import MIRROR, mirrored_se3
 from test_knee import FOUNDATION, SCENE, at
 from test_knee_plain_model import state_of, without_patella
+from tkamb.contact import samples
 from tkamb.contact.result import ContactStatus
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import mirrored_pose
@@ -221,6 +222,27 @@ def test_contact_in_python_is_in_si_and_simulate_takes_its_table():
     results = tkamb.simulate(SCENE, contact=table, frames=slice(60, 61))
     assert results.summary["contact"]["model"] == "hertz"
     assert results.summary["contact"]["resolution_mm"] == 2.0
+
+
+def test_the_second_knee_shares_the_prepared_contact(read, monkeypatch):
+    """Nothing is prepared again, unless meshes, material, options or settings differ."""
+    plain = without_patella(read[0])
+
+    def state(implant=plain.implant, resolution=2e-3):
+        model = tkamb.contact_model("foundation", resolution=resolution)
+        knee = tkamb.Knee(plain.model, implant=implant, contact=model)
+        knees.append(knee)  # a contact is shared as long as a knee uses it
+        return knee.contact.state
+
+    knees = []
+    first = state()
+    assert state() is first
+    assert state(resolution=3e-3) is not first
+    assert state(replace(plain.implant, material="polyethylene-linear")) is not first
+    moved = replace(plain.implant.insert, vertices=plain.implant.insert.vertices + 1e-6)
+    assert state(replace(plain.implant, insert=moved)) is not first
+    monkeypatch.setattr(samples, "MAP_POINT", replace(samples.MAP_POINT, rim_rays=4))
+    assert state() is not first
 
 
 def test_a_repr_is_short(read):

@@ -7,7 +7,7 @@ from types import ModuleType
 
 from tkamb.cli import main
 from tkamb.commands.settings import PACKAGE, all_settings, field_docstrings
-from tkamb.run.settings import changed_settings
+from tkamb.settings import changed_settings
 
 
 def settings_classes():

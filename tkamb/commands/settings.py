@@ -1,6 +1,6 @@
 """The settings of tkamb's algorithms (`tkamb settings`).
 
-`tkamb.run.settings` describes a settings object. This module finds those of the package.
+`tkamb.settings` describes a settings object. This module finds those of the package.
 """
 
 import argparse
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from tkamb.errors import InputError
-from tkamb.run.settings import SUFFIX
+from tkamb.settings import SUFFIX
 
 PACKAGE = Path(__file__).parents[1]
 

@@ -134,8 +134,9 @@ class AssembledKnee:
             self.extensor_lines = extensor_lines(self.bridge, extensor, self._surfaces)
         self.contact: KneeContact | None = None
         if contact is not None:
-            prepared = prepared_contact(contact, self.implant, self._surfaces, cache)
-            self.contact = prepared.changed(self.friction)
+            # Another knee with the same implant and model shares it, as long as one of them lives.
+            self._prepared = prepared_contact(contact, self.implant, self._surfaces, cache)
+            self.contact = self._prepared.changed(self.friction)
         self._identity = _identity(self)
 
     def _set_ligaments(self, bundles: "Iterable[Ligament]") -> None:

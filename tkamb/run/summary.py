@@ -32,8 +32,8 @@ from tkamb.run.discrepancy import discrepancy_summary
 from tkamb.run.identity import relative_paths, scene_hash
 from tkamb.run.known_errors import as_json, known_error, left_out
 from tkamb.run.read_scene import STRAIN_FLEXIONS
-from tkamb.run.settings import changed_settings
 from tkamb.run.status import FAILED
+from tkamb.settings import changed_settings
 from tkamb.units import DEGREE, MILLIMETRE
 
 RESIDUALS = (
