@@ -21,6 +21,7 @@ from tkamb.contact.foundation import (
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import PRESS, press_by_search, search_load
+from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactStatus
 from tkamb.contact.samples import meet, sample_surface
 from tkamb.errors import InputError
@@ -198,6 +199,22 @@ def test_loads_of_any_size_are_reached(load):
     assert result.status is ContactStatus.OK
     assert -result.wrench_on_insert[1] == pytest.approx(load, rel=1e-6)
     assert result.iterations < 50
+
+
+@pytest.mark.parametrize("name", ["foundation", "foundation-linear", "hertz", "lattice-linear"])
+@pytest.mark.parametrize("depth", [10.5e-3, 25e-3, 31e-3, 50e-3, 80e-3])
+def test_a_femur_pushed_through_the_insert_is_out_of_range(name, depth):
+    """The depths run from the bottom of the insert to a femur that lies wholly below it."""
+    pair = ContactPair(graded_sphere(10e-3), flat_insert(HEIGHT), material("polyethylene"))
+    model = contact_model(name, resolution=3e-3)
+    state = model.prepare(pair)
+    at = pose(np.eye(3), [0.1e-3, HEIGHT + 10e-3 - depth, 0.1e-3])
+    result = model.evaluate(state, at)
+    assert result.status is ContactStatus.OUT_OF_RANGE
+    assert result.flags
+    assert not model.probe(state).at(at).known
+    above = pose(np.eye(3), [0.1e-3, HEIGHT + 11e-3, 0.1e-3])
+    assert model.evaluate(state, above).status is ContactStatus.OK
 
 
 def test_zero_load_is_first_touch():

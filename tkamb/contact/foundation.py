@@ -328,7 +328,8 @@ class FoundationProbe:
     def _of(self, samples: SurfaceSamples, meeting: Meeting, pose: Array) -> ProbedContact:
         """Return the contact of loaded columns."""
         if not len(meeting.gap):
-            return ProbedContact({}, tangent=True)
+            through = self._state.pair.passed_through(pose) is not None
+            return ProbedContact({}, known=not through, tangent=True)
         strain = -meeting.gap / np.maximum(samples.thickness, FOUNDATION.least_thickness)
         if not (strain < DEEPEST).all():
             return ProbedContact({}, known=False)

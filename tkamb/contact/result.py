@@ -171,6 +171,8 @@ class ContactResult:
         surface, pose = state.surface, np.array(pose, float)
         if not np.isfinite(pressure).all():
             return cls.failed(state, pose, "the femoral component lies too deep in the insert")
+        if not pressure.any() and (passed := state.pair.passed_through(pose)):
+            return cls.failed(state, pose, passed)
         area = surface.area if area is None else area
         if nodal_force is None:
             nodal_force = -(pressure * area)[:, None] * surface.normals
