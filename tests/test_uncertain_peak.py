@@ -121,5 +121,7 @@ def test_the_summary_compares_the_nominal_peak_with_the_samples(tmp_path):
     assert peak["samples"] == 20
     assert peak["nominal"] == pytest.approx(np.nanmax(uncertainty.results["force_total_BW"]))
     lines = headline(uncertainty)
-    assert lines[0].startswith("peak total force: ")
-    assert any(line.startswith("peak total force at ") for line in lines)
+    assert lines[0].startswith("peak total force (superior-inferior component): ")
+    assert any(line.startswith("peak total force (resultant) at ") for line in lines)
+    peaks = [line for line in lines if line.startswith("peak ")]
+    assert all("force (" in line for line in peaks) and len(set(peaks)) == len(peaks)

@@ -131,6 +131,10 @@ def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     return 0
 
 
+QUANTITIES = {"total": "superior-inferior component"}
+"""Name of a peak -> the quantity, where it is no condyle's normal force."""
+
+
 def headline(uncertainty: "Uncertainty") -> list[str]:
     """Return lines of text: the band of the peak force and the most influential inputs."""
     from numpy import isfinite, nanargmax
@@ -153,9 +157,12 @@ def headline(uncertainty: "Uncertainty") -> list[str]:
             f"{sampled_peak['p95']:.2f}"
         )
     peaks = peaks_of(uncertainty.results.summary)
-    lines = [f"peak {name} force: {peak_words(peak)} BW" for name, peak in peaks.items()]
+    lines = [
+        f"peak {name} force ({QUANTITIES.get(name, 'normal force')}): {peak_words(one)} BW"
+        for name, one in peaks.items()
+    ]
     lines += [f"({peak_legend(peaks)})"] if peaks else []
-    lines += [f"peak total force at {flexion:.0f} deg: {value} ({words})"]
+    lines += [f"peak total force (resultant) at {flexion:.0f} deg: {value} ({words})"]
     limits = muscle_limits(uncertainty.results)
     lines += [limits.line()] if limits is not None else []
     chance_share = TERMS / uncertainty.results.summary["uncertainty"]["samples"]
