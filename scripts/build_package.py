@@ -2,6 +2,7 @@
 """Build the sdist from the files in git, and the wheel from the sdist.
 
 Usage: scripts/build_package.py FOLDER
+       scripts/build_package.py --floors    print the lowest allowed version of each dependency
 """
 
 import os
@@ -10,6 +11,7 @@ import subprocess
 import sys
 import tarfile
 import tempfile
+import tomllib
 from pathlib import Path
 
 from setuptools import build_meta
@@ -46,5 +48,18 @@ def known_files() -> list[str]:
     return [name for name in listed.split("\0") if name and (ROOT / name).is_file()]
 
 
+def floors() -> list[str]:
+    """Return the lowest allowed versions of the dependencies and extras, as constraints of pip."""
+    with (ROOT / "pyproject.toml").open("rb") as file:
+        project = tomllib.load(file)["project"]
+    extras = project["optional-dependencies"]
+    users = [line for name in ("data", "muscles", "cohort", "cluster") for line in extras[name]]
+    return [
+        line.partition(",")[0].replace(">=", "==") for line in (*project["dependencies"], *users)
+    ]
+
+
 if __name__ == "__main__":
+    if sys.argv[1] == "--floors":
+        sys.exit(print("\n".join(floors())))
     print("\n".join(str(made) for made in build(Path(sys.argv[1]).resolve())))

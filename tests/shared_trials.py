@@ -13,12 +13,14 @@ THIGH = np.array([[-0.05, 0.36, 0.03], [-0.03, 0.01, -0.02]])
 """m: ends of the flexors, tibia and femur link. The lines are behind the knee."""
 
 
-def two_flexors(frames, strengths=STRENGTHS, reserve=10.0, least=0.05, weights="equal"):
+def two_flexors(
+    frames, strengths=STRENGTHS, reserve=10.0, least=0.05, weights="equal", least_share=0.0
+):
     """Return a trial of three muscles and one coordinate."""
     names = ("quadriceps", "hamstring", "gastrocnemius")
     ends = [("femur_r", [0.0, 0.0, 0.0]), ("tibia_r", [0.0, 0.0, 0.0])]
     muscles = [muscle(n, *ends, force=f) for n, f in zip(names, strengths, strict=True)]
-    sharing = Sharing(reserve=reserve, lowest=least, weights=weights)
+    sharing = Sharing(reserve=reserve, lowest=least, weights=weights, least_share=least_share)
     strength = np.tile(strengths, (frames, 1))
     moment, arms = np.zeros((frames, 1)), np.zeros((frames, 3, 1))
     problems = FrameProblems(muscles, ("knee",), sharing, moment, arms, strength, 0.0 * strength)

@@ -118,12 +118,79 @@ def test_a_wrong_number_of_frames_is_refused(tmp_path, stated):
         read_c3d(path)
 
 
-def test_contradictory_header_and_parameters_are_refused(tmp_path):
-    path = raw().write(tmp_path / "a.c3d", POINTS, ANALOG)
+def header_word(number, value):
+    """Return a change of a 16-bit word of the header, counted from 1."""
+
+    def change(content):
+        content[2 * number - 2 : 2 * number] = value.to_bytes(2, "little")
+
+    return change
+
+
+def parameter_value(group, name, value):
+    """Return a change of the first value of an integer or float parameter."""
+
+    def change(content):
+        at = content.index(name.encode(), content.index(group.encode(), 512)) + len(name) + 2
+        size = {2: 2, 4: 4}[content[at]]
+        first = at + 2 + content[at + 1]
+        new = value.to_bytes(2, "little") if size == 2 else np.float32(value).tobytes()
+        content[first : first + size] = new
+
+    return change
+
+
+CONTRADICTIONS = {
+    "markers of the header": [header_word(2, 7)],
+    "markers of the parameter": [parameter_value("POINT", "USED", 2)],
+    "channels for values": [header_word(3, 2)],
+    "values of the header": [header_word(3, 30)],
+    "channels of the parameter": [parameter_value("ANALOG", "USED", 5)],
+    "samples of the header": [header_word(10, 5)],
+    "no samples": [header_word(10, 0)],
+    "integers by the parameter": [parameter_value("POINT", "SCALE", 0.1)],
+    "two at once": [header_word(2, 7), header_word(3, 2)],
+}
+
+
+@pytest.mark.parametrize("name", CONTRADICTIONS)
+def test_contradictions_that_the_size_of_the_file_decides_are_resolved(tmp_path, name):
+    points, analog = np.tile(POINTS, (20, 1, 1)), np.tile(ANALOG, (20, 1))
+    path = raw().write(tmp_path / "a.c3d", points, analog)
+    expected = read_c3d(path)
+    assert expected.notices == ()
     content = bytearray(path.read_bytes())
-    content[2] = 7  # number of markers in the header
-    path.write_bytes(content)
-    with pytest.raises(InputError, match="holds 7 markers by its header, 3 by POINT:USED"):
+    for change in CONTRADICTIONS[name]:
+        change(content)
+    (tmp_path / "b.c3d").write_bytes(content)
+    recording = read_c3d(tmp_path / "b.c3d")
+    np.testing.assert_array_equal(recording.points, expected.points)
+    assert recording.channels.keys() == expected.channels.keys()
+    for channel, values in expected.channels.items():
+        np.testing.assert_array_equal(recording.channels[channel], values)
+    (notice,) = recording.notices
+    assert "fits 3 markers and 2 analog channels with 10 samples per frame, as floats" in notice
+
+
+@pytest.mark.parametrize("change", [header_word(2, 4), header_word(3, 30), header_word(10, 3)])
+def test_contradictions_that_no_size_decides_are_refused(tmp_path, change):
+    """Two frames of either layout, or of neither, end within the last block."""
+    content = bytearray(raw().write(tmp_path / "a.c3d", POINTS[:2], ANALOG[:20]).read_bytes())
+    change(content)
+    if content[18] == 3:
+        content += bytes(4096)
+    (tmp_path / "a.c3d").write_bytes(content)
+    with pytest.raises(InputError, match=r"by its header|which is no multiple"):
+        read_c3d(tmp_path / "a.c3d")
+
+
+@pytest.mark.parametrize("labels", [True, False])
+def test_a_recording_of_rotations_alone_is_named(tmp_path, labels):
+    file = RawC3d().add("ROTATION", "USED", [7]).add("ROTATION", "DATA_START", [9])
+    if labels:
+        file.add("ROTATION", "LABELS", [f"S{k}" for k in range(7)])
+    path = file.write(tmp_path / "a.c3d", POINTS[:, :0])
+    with pytest.raises(InputError, match=r"rotations of 7 segments, and no markers.*--motion"):
         read_c3d(path)
 
 

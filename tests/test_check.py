@@ -80,6 +80,44 @@ def test_a_ground_reaction_in_the_wrong_unit_raises_a_question(scene, checked):
     assert json.loads(json.dumps(result)) == result
 
 
+FILES = ("motion.csv", "ground_reaction.csv", "tibia.csv", "implant.csv")
+
+
+def test_notices_on_every_recording_reach_check_run_summary_and_report(tmp_path, capfd):
+    from tkamb.run.results_folder import read_results
+
+    scene = lay_out(tmp_path / "knee")
+    (scene.parent / "implant.csv").write_text("time,F\n1.0,367.75\n2.0,1471\n3.3,735.5\n")
+    table = (
+        '[measured]\nfile = "implant.csv"\ncolumns = {total = "F"}\nunit = "N"\noffset_s = 0.0\n'
+    )
+    scene.write_text(f"{scene.read_text()}\n{table}")
+    for name in FILES:
+        header, *rows = (scene.parent / name).read_text().splitlines()
+        rows = [f"{header},x,x", *(f"{row},1,2" for row in rows)]
+        (scene.parent / name).write_text("\n".join(rows) + "\n")
+    expected = [f"{name}: has two columns named 'x'; neither is used" for name in FILES]
+    result = check_scene(scene)
+    assert sorted(result.as_dict()["notices"]) == sorted(expected)
+    assert all(f"notice: {notice}" in result.lines() for notice in expected)
+    figure = draw_leg(result.case, result.mechanics)
+    assert all(notice.replace("'", "&#39;") in check_html(result, figure) for notice in expected)
+    out = tmp_path / "out"
+    run = [
+        "run",
+        str(scene),
+        "--contact=foundation",
+        "--resolution=4",
+        "--frames=2:3",
+        f"--out={out}",
+    ]
+    assert main(run) == 0
+    error = capfd.readouterr().err
+    assert all(error.count(f"notice: {notice}") == 1 for notice in expected)
+    assert sorted(read_results(out).summary["remarks"]) == sorted(expected)
+    assert "Notices on recordings" in (out / "report.html").read_text(encoding="utf-8")
+
+
 def test_the_drawn_leg_agrees_with_the_chain_and_the_force_plate(checked):
     """Segments keep their lengths, the hip is above the ankle, the force acts on the plate."""
     case = checked.case

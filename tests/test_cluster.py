@@ -1,11 +1,13 @@
 """Jobs on a Dask cluster: the same results as in this process, also after a crash."""
 
+import functools
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -60,10 +62,29 @@ def test_a_missing_scheduler_is_an_error_of_one_line(address, tmp_path, monkeypa
     assert not folder.exists()
 
 
+def test_dask_local_listens_on_no_port():
+    """A scheduler would serve addresses and folders by HTTP to every user of the machine."""
+    task, jobs = Task(functools.partial, (max,)), [(n, n) for n in range(3)]
+    crew = PoolOptions(2, "local")
+    with crew.team(task, len(jobs)) as team:
+        answers = dict(team.answers(jobs))
+        assert len(team.processes) == 2
+        numbers = {os.getpid(), *(process.pid for process in team.processes)}
+        listening = set()
+        for number in numbers:
+            lines = Path(f"/proc/{number}/net/tcp").read_text().splitlines()[1:]
+            inodes = {line.split()[9] for line in lines if line.split()[3] == "0A"}
+            for file in Path(f"/proc/{number}/fd").iterdir():
+                with suppress(OSError):
+                    listening |= {inode for inode in inodes if f"[{inode}]" in os.readlink(file)}
+        assert not listening
+    assert answers == {0: 0, 1: 1, 2: 2}
+
+
 def test_without_dask_the_error_gives_the_install_command(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"pip install 'tkamb\[cluster\]'"):
-        PoolOptions(1, "local").check()
+        PoolOptions(1, "tcp://host:1").check()
 
 
 def test_the_number_of_workers_is_limited():
@@ -196,14 +217,3 @@ def test_a_killed_scheduler_is_a_computation_error(start):
     with pytest.raises(ComputationError, match="scheduler has ended"):
         list(killing(answers))
     assert 5 <= len(results) < 400
-
-
-@pytest.mark.slow
-def test_a_local_cluster_gives_the_bands_of_this_process():
-    distributed()
-    scene = bodies_alone(uncertainty__segment_mass=0.1)
-    options = {"samples": 24, "frames": slice(0, 101, 50)}
-    local_run = estimate_uncertainty(scene, **options)
-    cluster_run = estimate_uncertainty(scene, **options, dask="local", workers=2)
-    for name, band in local_run.bands.items():
-        np.testing.assert_array_equal(band, cluster_run.bands[name])

@@ -24,7 +24,8 @@ from tkamb.contact.registry import (
 from tkamb.errors import InputError
 from tkamb.io.scene import load_scene
 from tkamb.run.identity import CONTACT_CODE, contact_code, foreign_code
-from tkamb.run.results_folder import verify_results, write_results
+from tkamb.run.reproduction import verify_results
+from tkamb.run.results_folder import write_results
 from tkamb.run.simulation import simulate
 from tkamb.show.comparison import compare_folders
 from tkamb.studies import tradeoff

@@ -77,7 +77,6 @@ def test_an_array_in_another_file_is_not_followed(copy, tmp_path, capfd, link_ty
         ("frames", 10**400),
         ("questions", "one"),
         ("peaks_BW", {"total": "large"}),
-        ("peaks_BW", {"total": {"nominal": 2.0, "p05": 1.0}}),
         ("discrepancy", "small"),
         ("peak_pressure", {"MPa": None}),
         ("gait", {"stance_s": [0.1]}),

@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -10,14 +11,16 @@ from pathlib import Path
 import pytest
 
 import tkamb.__main__
-from scenes import MODEL, write_scene
+from scenes import MODEL, fast_scene, write_scene
 from tkamb import files
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.files import read_bytes, read_xml
 from tkamb.io.recordings.tables import read_table
-from tkamb.run.guard import interrupt_as_such, printable
+from tkamb.run.guard import interrupt_as_such, printable, terminated_as_interrupted
 from tkamb.run.press import PressReport
+from tkamb.run.results_folder import read_results
+from tkamb.run.simulation import simulate
 
 ROOT = Path(__file__).parents[1]
 MESHES = [str(MODEL / name) for name in ("femoral_component.stl", "insert.stl")]
@@ -248,3 +251,36 @@ def test_a_folder_of_a_scene_has_its_run_as_remedy(tmp_path, capsys):
     (tmp_path / "scene.toml").touch()
     assert main(["report", str(tmp_path)]) == 2
     assert f"tkamb run {tmp_path / 'scene.toml'}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_terminated_live_window_leaves_nothing(tmp_path, number):
+    command = [sys.executable, "-m", "tkamb.cli", "live", str(fast_scene()), "--out", "kept"]
+    environment = os.environ | {"TMPDIR": str(tmp_path), "PYTHONPATH": str(ROOT), "BROWSER": "true"}
+    process = subprocess.Popen(
+        command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True
+    )
+    while not (line := process.stderr.readline()).startswith("tkamb: live:"):
+        assert line
+    assert list(tmp_path.glob("tkamb-live-*"))
+    process.send_signal(number)
+    _, output = process.communicate(timeout=60)
+    assert process.returncode == 130 and output.splitlines()[-1].startswith("tkamb: interrupted")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_terminated_run_publishes_its_frames(tmp_path):
+    scene, out = fast_scene(), tmp_path / "out"
+
+    def terminated(frames):
+        for k in frames:
+            if k == 3:
+                signal.raise_signal(signal.SIGTERM)
+            yield k
+
+    with (
+        pytest.raises(KeyboardInterrupt, match="3 of 6 frames"),
+        terminated_as_interrupted(),
+    ):
+        simulate(scene, frames=slice(0, 6), directory=out, progress=terminated)
+    assert len(read_results(out).maps) == 3

@@ -1,4 +1,4 @@
-"""Inserts of several touching or overlapping bodies, and hollow inserts, act as one body."""
+"""Inserts of several bodies side by side and hollow inserts act as one body; a stack is refused."""
 
 import logging
 
@@ -42,15 +42,21 @@ def inside_out(surface):
 
 
 SOLID = slab(0.0, HEIGHT)
-TOUCHING = {
-    "meshed in two ways": [slab(0, 0.004), slab(0.004, HEIGHT, (10, 1, 16))],
+STACKED = {
     "meshed alike": [slab(0, 0.004), slab(0.004, HEIGHT)],
+    "meshed in two ways": [slab(0, 0.004), slab(0.004, HEIGHT, (10, 1, 16))],
     "no vertex in common but at the corners": [slab(0, 0.004, (7, 1, 9)), slab(0.004, HEIGHT)],
     "three layers": [slab(0, 0.003), slab(0.003, 0.006, (10, 1, 4)), slab(0.006, HEIGHT)],
+    "overlapping": [slab(0, 0.006), slab(0.004, HEIGHT, (7, 1, 9))],
+    "a smaller tray": [
+        block((-0.02, 0.02), (-0.004, 0.0), (-0.03, 0.03), (3, 1, 5)),
+        slab(0, HEIGHT),
+    ],
+}
+TOUCHING = {
     "side by side": [side(-WIDTH / 2, 0.0), side(0.0, WIDTH / 2, (10, 4, 3))],
 }
 OVERLAPPING = {
-    "overlapping": [slab(0, 0.006), slab(0.004, HEIGHT, (7, 1, 9))],
     "overlapping sideways": [side(-WIDTH / 2, 0.01), side(-0.01, WIDTH / 2)],
 }
 
@@ -80,12 +86,18 @@ def solid_peaks(tmp_path_factory):
     return {contact: peak(insert, contact) for contact in ("foundation", "lattice-linear")}
 
 
+@pytest.mark.parametrize("name", STACKED)
+def test_bodies_that_lie_on_each_other_are_refused(name, tmp_path):
+    """The lower one may be the metal tray, which would become polyethylene."""
+    with pytest.raises(InputError, match="lie on each other, like an insert on its tray"):
+        read(tmp_path, STACKED[name])
+
+
 @pytest.mark.parametrize("name", TOUCHING)
 def test_a_wall_between_touching_bodies_is_removed(name, tmp_path, solid_peaks, caplog):
     with caplog.at_level(logging.WARNING, "tkamb"):
         insert = read(tmp_path, TOUCHING[name])
-    if name != "meshed alike":  # both sides of this wall are removed as opposite duplicates
-        assert "inner wall" in caplog.text
+    assert "inner wall" in caplog.text
     assert insert.mesh.is_watertight
     assert insert.volume == pytest.approx(SOLID.volume, rel=1e-6)
     assert find_inner_wall(insert.vertices, insert.faces) is None

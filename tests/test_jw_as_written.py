@@ -82,7 +82,24 @@ def a_plate_of_unknown_type(content):
         plates[key]["value"] = np.concatenate([value, value[..., -1:]], axis=-1)
 
 
+def moments_in_newton_metres(content):
+    """The units of the moments still say N·mm."""
+    for plate in range(3):
+        content["data"]["analogs"][0, 6 * plate + 3 : 6 * plate + 6] *= 1e-3
+
+
+def moments_in_newton_metres_that_say_nothing(content):
+    """The plates are of type 4, with a calibration to N·m in a file in mm."""
+    plates, analog = content["parameters"]["FORCE_PLATFORM"], content["parameters"]["ANALOG"]
+    moments_in_newton_metres(content)
+    analog["UNITS"]["value"][:18] = ["V"] * 18
+    plates["TYPE"]["value"] = [4, 4, 4]
+    content.add_parameter("FORCE_PLATFORM", "CAL_MATRIX", np.repeat(np.eye(6)[:, :, None], 3, 2))
+
+
 CHANGES = [
+    moments_in_newton_metres,
+    moments_in_newton_metres_that_say_nothing,
     units_of_one_maker,
     equal_labels_of_the_arms,
     equal_channels,
@@ -97,6 +114,35 @@ def test_the_same_trial_in_another_form_gives_the_same_case(tmp_path, reference,
     change(content)
     content.write(str(tmp_path / "og3.c3d"))
     assert_same(imported(tmp_path / "out", "--c3d", tmp_path / "og3.c3d"), reference)
+
+
+def test_a_header_that_counts_channels_gives_the_same_case(tmp_path, reference, capsys):
+    """The third word of the header holds the number of channels, not of values per frame."""
+    content = bytearray(TRIAL.read_bytes())
+    values, samples = (int.from_bytes(content[at : at + 2], "little") for at in (4, 18))
+    content[4:6] = (values // samples).to_bytes(2, "little")
+    (tmp_path / "og3.c3d").write_bytes(content)
+    assert_same(imported(tmp_path / "out", "--c3d", tmp_path / "og3.c3d"), reference)
+    assert "the size of the file fits 56 markers" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("reversed_plates", [(0, 1, 2), (1,), (0,)])
+def test_a_force_that_points_down_is_named(tmp_path, reference, capsys, reversed_plates):
+    """The right foot stands on plates 2 and 3, the left one on plate 1."""
+    content = ezc3d.c3d(str(TRIAL))
+    for plate in reversed_plates:
+        content["data"]["analogs"][0, 6 * plate : 6 * plate + 6] *= -1
+    content.write(str(tmp_path / "og3.c3d"))
+    arguments = ("--c3d", tmp_path / "og3.c3d")
+    if reversed_plates == (0,):
+        assert_same(imported(tmp_path / "out", *arguments), reference)
+        printed = capsys.readouterr().out
+        assert "force plate 1: the vertical force points down, with up to" in printed
+        return
+    arguments = ["import", JW / "JW.osim", *arguments, "--side", "right", "--mass-kg", "66.7"]
+    assert main([*map(str, arguments), "--out", str(tmp_path / "out")]) == 2
+    number = 2 if 0 in reversed_plates else reversed_plates[0] + 1
+    assert f"force plate {number}: the vertical force points down" in capsys.readouterr().err
 
 
 def drift_without_a_baseline(content):

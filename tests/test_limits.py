@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 
 from tkamb.commands.options import _setting
@@ -67,15 +66,7 @@ def test_a_file_above_the_limit_is_not_hashed(tmp_path):
 def test_a_damaged_wear_state_is_refused(tmp_path, content):
     (tmp_path / STATE_NAME).write_bytes(content)
     with pytest.raises(InputError, match="damaged"):
-        kept_state(tmp_path, "identity", 5)
-
-
-def test_a_wear_state_with_wrong_shapes_is_refused(tmp_path):
-    arrays = {name: np.zeros(4) for name in ("wear", "creep", "fall")}
-    np.savez(tmp_path / "a.npz", identity="identity", rows="[]", **arrays)
-    (tmp_path / "a.npz").rename(tmp_path / STATE_NAME)
-    with pytest.raises(InputError, match="5 vertices"):
-        kept_state(tmp_path, "identity", 5)
+        kept_state(tmp_path, "identity")
 
 
 WRITER = """

@@ -118,10 +118,9 @@ REFUSED = {
     "milliseconds": (cells("motion.csv", "time_s", lambda v: 1e-3 * v), "time is in seconds"),
     "underscore": (cells("motion.csv", "flexion_deg", "1_000", 40), "plain decimal"),
     "Arabic digits": (cells("motion.csv", "flexion_deg", "٣٠", 40), "plain decimal"),
-    "semicolons": (text("motion.csv", lambda t: t.replace(",", ";")), "semicolons"),
     "decimal commas": (text("motion.csv", lambda t: t.replace(".", ",")), "not commas"),
-    "semicolons and commas": (
-        text("tibia.csv", lambda t: t.replace(",", ";").replace(".", ",")), "semicolons"),
+    "commas and points": (
+        text("tibia.csv", lambda t: t.replace(",", ";").replace(".", ",", 3)), "one decimal sign"),
     "stiffness": (key("ligament.0.stiffness_N_per_mm", 91250.0), "give it in N/mm, not in N/m"),
     "true": (key("patient.mass_kg", True), "not true"),
     "no list": (key("contact.released", "adduction"), r'is not a list; .*\["adduction"\]'),

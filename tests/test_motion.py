@@ -227,3 +227,10 @@ def test_a_header_that_contradicts_the_scene_is_refused(tmp_path):
     assert load_motion(coordinates_table(file), "right", EYE, EYE).coordinates[0, 5] > 0
     with pytest.raises(InputError, match="is in degrees by its own header"):
         load_motion(coordinates_table(file, angle_unit="rad"), "right", EYE, EYE)
+
+
+def test_a_recording_of_one_row_is_named(tmp_path):
+    path = write(tmp_path / "a.csv", {k: v[:1] for k, v in coordinate_columns(bend()).items()})
+    for changes in ({}, {"interval_s": (0.0, 1.0)}):
+        with pytest.raises(InputError, match="has one row, at 0 s, which is no movement"):
+            load_motion(coordinates_table(path, **changes), "right", EYE, EYE)

@@ -21,10 +21,10 @@ ALWAYS = {
     "--activity --note --muscles --cycle --scale-mass --keep-mass --knee --cutoff-hz",
     "run": "--as --contact --resolution --out --frames --set --no-cache --force --resume "
     "--workers "
-    "--profile --strict --json",
+    "--profile --pack --strict --json",
     "check": "--out --set --json",
     "new": "--side --mass-kg --height-mm --sex",
-    "verify": "",
+    "verify": "--inputs --rerun",
     "methods": "",
     "settings": "--json",
     "live": "--frame --contact --out --port",
@@ -38,7 +38,7 @@ ALWAYS = {
     "mesh part": "--out",
     "mesh lattice": "--resolution --units --axes --side --out --json",
     "data get": "--from --url --to",
-    "export": "--sto --vtp --deck",
+    "export": "--sto --vtp --figures --deck",
     "view": "--contact --frame --camera --lattice --html --png --gif --mp4",
     "tradeoff": "--quick --full --peer --recompute --resume --out --force --json",
     "stability": "--quick --resume --workers --out --force --json",
@@ -171,7 +171,9 @@ def offences() -> list[tuple[str, Rule, list[str]]]:
                     source = "--trc=a.trc"
                     if not {"--c3d", "--motion"} & {*beside}:
                         words.append("--c3d=a.c3d" if "--grf" in rule.excludes else source)
-                if command == "export" and not {"--sto", "--vtp", "--deck"} & {*beside}:
+                if command == "export" and not {"--sto", "--vtp", "--figures", "--deck"} & {
+                    *beside
+                }:
                     words.append("--sto=a.sto")
                 if command == "press":
                     words.append("--load=5")

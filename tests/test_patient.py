@@ -135,3 +135,34 @@ def test_missing_file_is_named(tmp_path):
     nowhere = PatientTable(urdf=tmp_path / "none.urdf", side="right", mass_kg=75.0)
     with pytest.raises(InputError, match=r"none\.urdf: no such URDF"):
         load_urdf(nowhere, True)
+
+
+@pytest.mark.parametrize("joint", ["knee_ml", "knee_flexion", "patella_rotation", "knee_adduction"])
+@pytest.mark.parametrize("change", [(1.0, 1.2e-9), (1.0, -4e-7), (1.2e-9, 0.0), (2.0, 0.0)])
+def test_rounding_and_length_of_an_axis_change_nothing(tmp_path, joint, change):
+    """The factors are of the axis, and of a component across it."""
+
+    def with_axis(factor, across):
+        def changed(match):
+            axis = factor * np.array([float(v) for v in match[2].split()])
+            axis[1] += across * factor
+            return match[1] + " ".join(map(repr, axis.tolist()))
+
+        return re.sub(rf'(name="{joint}".*?<axis xyz=")([^"]*)', changed, leg_urdf(), flags=re.S)
+
+    assert with_axis(*change) != with_axis(1.0, 0.0)
+    results = [load_urdf(table(tmp_path, with_axis(*pair)), True) for pair in ((1.0, 0.0), change)]
+    assert results[0] == results[1]
+    for wrong in ((1.0, 1e-4), (0.0, 0.0)):
+        with pytest.raises(InputError, match="it must be"):
+            load_urdf(table(tmp_path, with_axis(*wrong)), True)
+
+
+@pytest.mark.parametrize("limits", ["0 0", "0.3 0.3", "-1 -1"])
+def test_equal_limits_of_a_joint_are_accepted(tmp_path, limits):
+    low, high = limits.split()
+    text = re.sub('lower="[^"]*" upper="[^"]*"', f'lower="{low}" upper="{high}"', leg_urdf())
+    assert f'lower="{low}"' in text
+    load_urdf(table(tmp_path, text), True)
+    with pytest.raises(InputError, match="exchange them"):
+        load_urdf(table(tmp_path, text.replace(f'lower="{low}"', 'lower="9"')), True)

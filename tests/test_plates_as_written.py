@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from recordings import AMTI_CORNERS, standing_markers, write_c3d
-from test_c3d import COUNT, RATIO, plate_signals, pushes
+from test_c3d import COUNT, RATIO, Z0, A, B, plate_signals, pushes
 from tkamb.errors import InputError
 from tkamb.io.recordings.c3d import read_c3d
 from tkamb.io.recordings.ground_reaction import load_ground_reaction
@@ -250,7 +250,82 @@ def test_nan_samples_are_refused_only_between_the_frames(tmp_path, where):
     np.testing.assert_allclose(
         ground.force[:, 1], np.interp(frames, time, pushes()[0][:, 2]), atol=0.05
     )
-    assert "not numbers" in ground.notices[0]
+    assert "a.c3d: used from" in ground.remarks[0] and "not numbers" in ground.remarks[0]
+
+
+def mistaken(folder, kind, factor, **more):
+    """Write a plate whose lengths in moments are multiplied by a factor, and its units kept."""
+    a, b, z0 = A, B, Z0
+    origin = {1: np.zeros(3), 3: np.array([a, b, z0])}.get(kind, ORIGIN)
+    signals = plate_signals(kind if kind in (1, 3) else 2, AMTI_CORNERS, origin)
+    plate, units = {}, {1: ["N"] * 3 + ["mm"] * 2 + ["Nmm"], 3: ["N"] * 8}.get(kind)
+    if kind in (1, 2):
+        signals[3 : 5 if kind == 1 else 6] *= factor
+    elif kind == 3:
+        plate["origin"] = origin * factor
+    else:
+        channels = 6 if kind == 4 else 8
+        matrix = np.random.default_rng(1).normal(0.0, 1.0, (6, channels)) + 3 * np.eye(6, channels)
+        signals = np.linalg.pinv(matrix) @ signals
+        matrix[3:] *= factor
+        plate["matrix"], units = matrix, ["V"] * channels
+    return recorded(folder, kind, units, signals, origin=origin, plate=plate, **more)
+
+
+@pytest.mark.parametrize(
+    ("factor", "unit"), [(1.0, None), (1e-3, "m"), (1e3, None), (10.0, None), (0.1, None)]
+)
+@pytest.mark.parametrize("kind", [1, 2, 3, 4, 5])
+def test_a_unit_that_takes_the_pressure_off_the_plate_is_contradicted(tmp_path, kind, factor, unit):
+    """Moments in N·m that say N·mm are read. Errors that no usual unit explains are named."""
+    plate = read_c3d(mistaken(tmp_path, kind, factor)).plate(1)
+    if factor == 1.0 or unit:
+        np.testing.assert_allclose(plate.wrench, wrench(), atol=5e-3)
+    assert len(plate.notices) == (factor not in (1.0, 0.1))  # a tenth is on the plate, too
+    if unit:
+        assert ("m puts" if kind in (1, 3) else "N·m puts") in plate.notices[0]
+    elif plate.notices:
+        assert "lies beside the plate" in plate.notices[0]
+
+
+@pytest.mark.parametrize(("stated", "true"), [("Nm", "mm"), ("Nmm", "m"), ("Ncm", "m")])
+def test_the_unit_of_a_moment_is_read_from_the_plate_if_the_word_is_impossible(
+    tmp_path, stated, true
+):
+    signals = plate_signals(2, AMTI_CORNERS, ORIGIN)
+    signals[3:] *= {"mm": 1.0, "m": 1e-3}[true]
+    path = recorded(tmp_path, signals=signals, units=["N"] * 3 + [stated] * 3)
+    plate = read_c3d(path).plate(1)
+    if stated == "Ncm":  # the pressure would move by 2 mm, which is not impossible
+        assert plate.notices == ()
+        return
+    np.testing.assert_allclose(plate.wrench, wrench(), atol=1e-3)
+    assert f"N·{true} puts it under a foot" in plate.notices[0]
+    path = recorded(tmp_path, signals=signals, units=["N"] * 3 + ["huh"] * 3)
+    kept = read_c3d(path, GivenUnits(moment=stated)).plate(1)
+    assert "check units, CORNERS and ORIGIN" in kept.notices[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "count"),
+    [
+        ("FPCOPPOLY", np.full((6, 2, 1), 1e-6), 1),
+        ("FPCOPPOLY", np.zeros((6, 2, 1)), 0),
+        ("GAIN", [2.0], 1),
+        ("TRANSLATION", np.ones((3, 1)), 1),
+        ("MODEL", ["OR6-7"], 0),
+        ("CHANNEL2", [1.0], 0),
+    ],
+)
+def test_parameters_of_plates_that_are_not_understood_are_named(tmp_path, name, value, count):
+    import ezc3d
+
+    path = recorded(tmp_path)
+    file = ezc3d.c3d(str(path))
+    file.add_parameter("FORCE_PLATFORM", name, value)
+    file.write(str(path))
+    notices = read_c3d(path).all_notices
+    assert len(notices) == count and all(f"FORCE_PLATFORM:{name}" in n for n in notices)
 
 
 BAD_PLATES = {

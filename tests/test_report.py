@@ -18,7 +18,7 @@ from tkamb.errors import InputError
 from tkamb.run import metrics
 from tkamb.run.metrics import map_rows
 from tkamb.run.results import PERCENTILES, Results
-from tkamb.show.axis import horizontal_axis, round_step
+from tkamb.show.axis import horizontal_axis, round_step, shown_frames
 from tkamb.show.headline import cards
 from tkamb.show.panels import Line, Panel, panels
 from tkamb.show.plots import WIDTH, Sheet
@@ -217,7 +217,7 @@ def test_a_card_states_force_and_pressure_on_the_post(bend):
     assert post_card() == ("none", "Cam and post are not in contact.")
     force[80], pressure[80] = 0.5 * metrics.body_weight(bend), 32.9
     value, detail = post_card()
-    assert value == "0.50 BW" and f"{force[80]:.0f} N at " in detail and "32.9\u00a0MPa" in detail
+    assert value == "0.50 BW" and f"{force[80]:.0f} N at " in detail and "32.9 MPa" in detail
 
 
 def test_the_flexion_where_wrapping_begins_is_stated_between_two_frames(bend):
@@ -289,7 +289,7 @@ def test_several_questions_are_numbered(bend):
 
     title, axis = "Questions to answer", horizontal_axis(bend)
     assert asked("is it?") == "is it?"
-    assert asked("is it", "or not?") == "(1) is it (2) or not?"
+    assert asked("is it", "or not?") == "Answer them before you use a number. (1) is it (2) or not?"
 
 
 def test_residuals_are_relative_to_the_superior_inferior_force(bend):
@@ -736,3 +736,19 @@ def test_the_outline_of_the_insert_has_no_steps():
     assert np.abs(np.diff(edge)).max() < 1.0
     inside = np.pad(view.grey >= 0, 8)
     assert opacity.sum() == pytest.approx(inside.sum(), rel=0.02)
+
+
+def test_the_page_of_a_long_recording_shows_a_few_hundred_frames_and_says_so(monkeypatch):
+    monkeypatch.setattr("tkamb.show.axis.EVENLY_SHOWN", 20)
+    monkeypatch.setattr("tkamb.show.report.EVENLY_SHOWN", 20)
+    sizes = []
+    for frames in (60, 240):
+        run = make_run("bend", frames, maps=False)
+        run.columns["quadriceps_N"][33] = 1e5
+        shown = shown_frames(run)
+        assert {0, 33, frames - 1} <= {*shown.tolist()} and len(shown) < 60
+        text = report_html(run)
+        assert f"show {len(shown)} of the {frames} computed frames" in text
+        sizes.append(len(text))
+    assert sizes[1] < 1.05 * sizes[0]
+    assert len(shown_frames(make_run("bend", 12, maps=False))) == 12

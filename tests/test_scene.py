@@ -73,6 +73,16 @@ def test_an_override_wins_and_may_make_a_table(tmp_path):
     assert scene.patient.mass_kg == 80.0
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le"])
+def test_a_byte_order_mark_is_no_part_of_a_scene(tmp_path, encoding):
+    path = write_scene(tmp_path)
+    text = path.read_text(encoding="utf-8")
+    path.write_text(("\ufeff" if encoding == "utf-16-le" else "") + text, encoding=encoding)
+    assert load_scene(path) == load_scene(write_scene(tmp_path / "plain")).model_copy(
+        update=dict(load_scene(path))
+    )
+
+
 @pytest.mark.parametrize(
     ("changes", "drop", "words"),
     [

@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from knees import UP, bent_knee
 from shared_trials import SHANK, STRENGTHS, THIGH, two_flexors
 from tkamb.errors import InputError
-from tkamb.geometry.frames import knee_axes, knee_pose, pose, transform
+from tkamb.geometry.frames import SIDES, knee_axes, knee_pose, pose, transform
 from tkamb.io.scene import load_scene
+from tkamb.knee.condyle_rows import condyle_rows
 from tkamb.knee.crossing import CrossingLines, MuscleShare
 from tkamb.knee.equations import solve_knee
 from tkamb.knee.load import PointForces, total_wrench
@@ -67,6 +68,43 @@ def test_flexors_supply_the_moment_that_a_slack_quadriceps_lacks():
     assert abs(geometry.share.reserve[0]) < 0.02 * abs(alone.values["residual_flexion"])
     assert abs(loads.values.get("residual_flexion", 0.0)) < 0.25  # the patella's own weight
     assert np.linalg.norm(loads.contact_force) > np.linalg.norm(alone.contact_force) + 200.0
+
+
+def _with_share(where, least_share):
+    """Return geometry, the condyles' forces by all equations, and the rows at the same forces."""
+    trial = two_flexors(1, reserve=30.0, least=0.0, least_share=least_share)
+    frame = SharedMuscles(trial).frame(0)
+    geometry, loads = frame.solve(with_ground_force(where), FRICTION)
+    points = {side: one.point for side, one in geometry.condyles.items()}
+    rows = condyle_rows(geometry, frame.lines, points)
+    force = geometry.share.force
+    normal = rows.constant + rows.extensor * force[0] + rows.arms @ force[1:]
+    return geometry, np.array([loads.values.get(f"{side}_normal", 0.0) for side in SIDES]), normal
+
+
+def test_the_rows_of_the_condyles_agree_with_all_equations():
+    """Friction and the lean of the normals, which the rows neglect, change them by under 5 %."""
+    _, forces, rows = _with_share(GROUND_POINTS["behind"], 0.0)
+    np.testing.assert_allclose(rows, forces, atol=0.05 * forces.sum())
+
+
+def test_muscles_keep_the_least_share_of_load_on_each_condyle():
+    where = [-0.05, -0.45, -0.05]
+    _, alone, _ = _with_share(where, 0.0)
+    geometry, forces, rows = _with_share(where, 0.3)
+    least = int(np.argmin(alone))
+    assert alone[least] < 0.2 * alone.sum()
+    assert geometry.share.both_loaded
+    assert rows[least] == pytest.approx(0.3 * rows.sum(), rel=1e-6)
+    assert forces[least] == pytest.approx(0.3 * forces.sum(), abs=0.05 * forces.sum())
+    assert forces.sum() > alone.sum() + 50.0  # by co-contraction
+
+
+def test_a_share_that_no_muscle_forces_keep_is_reported():
+    """The ground reaction acts 0.3 m beside the knee: the flexors are too weak."""
+    geometry, forces, _ = _with_share([-0.05, -0.45, 0.3], 0.3)
+    assert not geometry.share.both_loaded
+    assert forces.min() == 0.0
 
 
 def test_muscles_without_strength_do_not_change_the_loads():

@@ -1,6 +1,7 @@
 """The files of `tkamb new` run unchanged, and the command replaces no file of the user."""
 
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -8,6 +9,8 @@ import pytest
 import tkamb
 from scenes import MODEL
 from tkamb.cli import main
+from tkamb.io.scene import load_scene
+from tkamb.io.starter import lay_out
 
 
 def test_the_new_scene_runs_unchanged(tmp_path):
@@ -61,3 +64,29 @@ def test_a_path_that_is_no_folder_is_refused(tmp_path, capfd, name):
     assert main(["new", str(tmp_path / name)]) == 2
     assert len(capfd.readouterr().err.strip().splitlines()) == 1
     assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_full_disk_is_named(tmp_path, capfd, monkeypatch):
+    def full(source, target, **_):
+        reason = f"[Errno 28] No space left on device: '{target}'"
+        raise shutil.Error([(str(source), str(target), reason)])
+
+    monkeypatch.setattr(shutil, "copytree", full)
+    assert main(["new", str(tmp_path / "knee")]) == 2
+    assert "cannot be written (No space left on device)" in capfd.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_scene_with_a_byte_order_mark_is_read(tmp_path):
+    scene = lay_out(tmp_path / "knee")
+    plain = load_scene(scene)
+    scene.write_bytes(b"\xef\xbb\xbf" + scene.read_bytes())
+    assert load_scene(scene) == plain
+
+
+def test_a_recording_of_one_row_is_named(tmp_path, capfd):
+    scene = lay_out(tmp_path / "knee")
+    motion = scene.parent / "motion.csv"
+    motion.write_text("".join(motion.read_text().splitlines(True)[:2]))
+    assert main(["run", str(scene), "--out", str(tmp_path / "out")]) == 2
+    assert "holds 1 row of motion" in capfd.readouterr().err

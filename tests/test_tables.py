@@ -35,6 +35,22 @@ def test_a_csv_with_comments_and_spaces_is_read(tmp_path):
     np.testing.assert_array_equal(table.complete_column("angle"), [1, 2])
 
 
+@pytest.mark.parametrize(
+    ("written", "words"),
+    [
+        ("time;Fz, N\n0,5;-1,25e3\n1;\n", "semicolons between its cells and commas in its numbers"),
+        ("time\tFz, N\n0.5\t-1.25e3\n1\t\n", "tabs between its cells"),
+    ],
+)
+def test_a_csv_of_a_german_spreadsheet_is_read_with_a_notice(tmp_path, written, words):
+    path = tmp_path / "measured.csv"
+    path.write_text(written)
+    table = read_table(path)
+    assert table.column("time").tolist() == [0.5, 1.0]
+    assert table.column("Fz, N")[0] == -1250.0 and np.isnan(table.column("Fz, N")[1])
+    assert words in table.notices[0]
+
+
 @pytest.mark.parametrize("suffix", ["sto", "mot"])
 def test_storage_reads_header_and_columns(tmp_path, suffix):
     text = "walk\nversion=1\ninDegrees=yes\nendheader\ntime\tknee\n0\t1\n1\t2\n"

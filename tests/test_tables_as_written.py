@@ -92,6 +92,77 @@ def test_quoted_cells_of_a_csv_are_read(tmp_path):
     np.testing.assert_array_equal(read_table(tmp_path / "a.csv").column("x"), [1.5, 2.0])
 
 
+LABELS = "Frame#\tTime\tR.Heel\t\t\tR.Toe\t\t"
+
+
+def as_spreadsheet(line, separator):
+    """Return a line with another separator, padded to the width of the table."""
+    return separator.join((line.split("\t") + [""] * 8)[:8])
+
+
+@pytest.mark.parametrize("separator", [",", ";"])
+@pytest.mark.parametrize("quoted", [False, True])
+def test_tables_that_a_spreadsheet_saved_with_other_separators_are_read(
+    tmp_path, separator, quoted
+):
+    plain = trc(tmp_path, LABELS)
+    lines = (tmp_path / "a.trc").read_text().splitlines()
+    lines = [as_spreadsheet(line, separator) for line in lines]
+    if quoted:
+        lines = [separator.join(f'"{cell}"' for cell in line.split(separator)) for line in lines]
+    (tmp_path / "a.trc").write_text("\n".join(lines), encoding="utf-8")
+    table = read_table(tmp_path / "a.trc")
+    word = {",": "commas", ";": "semicolons"}[separator]
+    assert len(table.notices) == 1 + quoted and f"has {word} between" in table.notices[-1]
+    assert table.length_unit == "mm" and table.columns.keys() == plain.columns.keys()
+    for name, values in plain.columns.items():
+        np.testing.assert_array_equal(table.column(name), values)
+    text = (STORAGE.format(rows=2, degrees="no", more="") + "time\tknee\n0\t1\n0.1\t2\n").split(
+        "\n"
+    )
+    (tmp_path / "a.mot").write_text("\n".join(as_spreadsheet(t, separator)[:-6] for t in text))
+    table = read_table(tmp_path / "a.mot")
+    assert table.in_degrees is False and len(table.notices) == 1
+    np.testing.assert_array_equal(table.column("knee"), [1.0, 2.0])
+
+
+@pytest.mark.parametrize("part", ["all", "header", "names", "rows"])
+def test_quotes_and_tabs_around_the_cells_of_a_storage_file_are_left_out(tmp_path, part):
+    rows = {"header": (0, 5), "names": (5, 6), "rows": (6, 8), "all": (0, 8)}[part]
+    lines = (STORAGE.format(rows=2, degrees="no", more="") + "time\tknee\n0\t1\n0.1\t2").split("\n")
+    assert lines[4] == "endheader" and len(lines) == 8
+    for k in range(*rows):
+        lines[k] = "\t".join(f'"{cell}"' for cell in lines[k].split("\t")) + "\t\t"
+    (tmp_path / "a.mot").write_text("\n".join(lines), encoding="utf-8")
+    table = read_table(tmp_path / "a.mot")
+    assert table.in_degrees is False and "has quotes around" in table.notices[0]
+    np.testing.assert_array_equal(table.column("knee"), [1.0, 2.0])
+
+
+@pytest.mark.parametrize("where", ["all", "rows", "labels"])
+def test_a_tab_before_each_row_of_a_trc_is_left_out(tmp_path, where):
+    plain = trc(tmp_path, LABELS)
+    labels = LABELS if where == "rows" else "\t" + LABELS
+    rows = ROWS if where == "labels" else ["\t" + row for row in ROWS]
+    counts = "\t" + COUNTS if where == "all" else COUNTS
+    table = trc(tmp_path, labels, rows=rows, counts=counts)
+    assert len(table.notices) == (where != "labels")
+    for name, values in plain.columns.items():
+        np.testing.assert_array_equal(table.column(name), values)
+    unnumbered = trc(tmp_path, LABELS, rows=[row[1:] for row in ROWS])  # the frames lack numbers
+    np.testing.assert_array_equal(unnumbered.column("R.Heel_x"), plain.column("R.Heel_x"))
+
+
+def test_decimal_commas_are_no_separators(tmp_path):
+    for rows in (
+        ["1\t0,00\t1\t2\t3\t4\t5\t6"],
+        [";".join(["1", "0,00", "1", "2", "3", "4", "5", "6"])],
+    ):
+        labels = LABELS.replace("\t", ";") if ";" in rows[0] else LABELS
+        with pytest.raises(InputError, match="a decimal point, not a comma"):
+            trc(tmp_path, labels, rows=rows)
+
+
 def test_labels_with_blanks_in_them_between_tabs_or_many_blanks(tmp_path):
     for labels in ("Frame#\tTime\tR heel\t\t\tR toe\t\t", "Frame#   Time   R heel    R toe"):
         np.testing.assert_array_equal(trc(tmp_path, labels).column("R heel_y"), 2.0)
@@ -277,6 +348,61 @@ def test_several_forces_under_one_foot_are_summed(tmp_path):
     np.testing.assert_allclose(summed.ground.moment, case.ground.moment, atol=1e-5)
 
 
+def external_loads(tmp_path, body="foot_r", number=2, root=True, frame="ground", datafile="g.mot"):
+    """Write a list of external loads: one force on the foot, and one on another body."""
+    entries = "".join(
+        f'<ExternalForce name="F{k}"><applied_to_body>{b}</applied_to_body>'
+        f"<force_expressed_in_body>{frame}</force_expressed_in_body>"
+        f"<force_identifier>ground_force_{k}_v</force_identifier>"
+        f"<point_identifier>ground_force_{k}_p</point_identifier>"
+        f"<torque_identifier>ground_moment_{k}_m</torque_identifier></ExternalForce>"
+        for k, b in ((3 - number, "pelvis"), (number, body))
+    )
+    text = f"<objects>{entries}</objects><datafile>{datafile}</datafile>"
+    text = f'<ExternalLoads name="x">{text}</ExternalLoads>'
+    if root:
+        text = f'<?xml version="1.0"?><OpenSimDocument Version="40000">{text}</OpenSimDocument>'
+    (tmp_path / "loads.xml").write_text(text)
+    return str(tmp_path / "loads.xml")
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"root": False}, {"body": "/bodyset/foot_r"}, {"frame": "/ground"}]
+)
+def test_a_list_of_external_loads_says_which_force_is_the_foots(tmp_path, options):
+    arguments = recorded_leg(tmp_path)
+    table = two_forces(tmp_path)
+    assert main(changed(arguments, grf=table, grf_force="ground_force_2")) == 0
+    listed = changed(arguments, grf=external_loads(tmp_path, **options), out=str(tmp_path / "x"))
+    assert main(listed) == 0
+    cases = [load_case(load_scene(tmp_path / name / "scene.toml")) for name in ("out", "x")]
+    for part in ("force", "point", "moment"):
+        np.testing.assert_array_equal(*(getattr(case.ground, part) for case in cases))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"body": "tibia_r"}, "applies no force to the foot .foot_r., but to pelvis, tibia_r"),
+        ({"frame": "foot_r"}, "in the frame 'foot_r', which is not read"),
+        ({"datafile": "h.mot"}, "h.mot"),
+        ({"number": 1}, ""),
+        ({"number": 5}, "names columns 'ground_force_5_v…'"),
+    ],
+)
+def test_a_list_of_external_loads_that_names_no_force_of_the_foot_is_refused(
+    tmp_path, capsys, options, words
+):
+    arguments = recorded_leg(tmp_path)
+    two_forces(tmp_path)
+    status = main(changed(arguments, grf=external_loads(tmp_path, **options)))
+    error = capsys.readouterr().err
+    if options == {"number": 1}:  # the force is a metre beside the foot
+        assert status == 2 and "from the ankle" in error
+        return
+    assert status == 2 and words.replace(".foot_r.", "(foot_r)") in error
+
+
 @pytest.mark.parametrize("span", [(0.0009, 0.99), (0.1, 0.8), (-0.3, 0.7)])
 def test_only_the_common_time_of_motion_and_force_is_used(tmp_path, capsys, span):
     arguments = recorded_leg(tmp_path)
@@ -292,6 +418,45 @@ def test_only_the_common_time_of_motion_and_force_is_used(tmp_path, capsys, span
     (tmp_path / "out" / "scene.toml").write_text(whole)
     time = load_case(load_scene(tmp_path / "out" / "scene.toml")).motion.time
     assert time[0] >= span[0] and time[-1] <= span[1] and np.ptp(time) > 0.5
+
+
+def walking_leg(tmp_path):
+    """Write a leg that stands from 0.4 to 0.7 s between two steps; return its import and foot."""
+    arguments = recorded_leg(tmp_path)
+    table = read_table(tmp_path / "leg.trc")
+    time = np.arange(60) / 60.0
+    forward = np.interp(time, [0.2, 0.4, 0.7, 0.9], [0.0, 0.7, 0.7, 1.4])
+    labels = [name[:-2] for name in table.columns if name.endswith("_x")]
+    markers = {
+        name: np.stack([table.columns[f"{name}_{axis}"] for axis in "xyz"], axis=1)
+        * table.unit_scale(None, "")
+        + np.outer(forward, [1.0, 0.0, 0.0])
+        for name in labels
+    }
+    write_trc(tmp_path / "leg.trc", time, markers, 60.0)
+    return arguments, time, np.mean([markers[n] for n in labels if "foot_r" in n], axis=0)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.02, 0.25, -0.2, 0.4])
+@pytest.mark.parametrize("named", [True, False])
+def test_force_and_motion_on_two_clocks_are_refused_with_the_shift(tmp_path, capsys, shift, named):
+    """The foot is loaded while it stands; the force's clock is late by `shift`."""
+    arguments, time, foot = walking_leg(tmp_path)
+    columns, stands = {"time": time + shift}, (time >= 0.4) & (time <= 0.7)
+    for k, axis in enumerate("xyz"):
+        columns[f"ground_force_1_v{axis}"] = np.where(stands, [10.0, 400.0, 5.0][k], 0.0)
+        columns[f"ground_force_1_p{axis}"] = foot[:, k] * (k != 1)
+        columns[f"ground_force_2_v{axis}"] = np.where(stands, [10.0, 300.0, 5.0][k], 0.0)
+        columns[f"ground_force_2_p{axis}"] = foot[:, k] * (k != 1) + (k == 2)
+    write_storage(tmp_path / "g.mot", columns, in_degrees=False)
+    options = {"grf_force": "ground_force_1"} if named else {}
+    status = main(changed(arguments, grf=str(tmp_path / "g.mot"), **options))
+    error = capsys.readouterr().err
+    if abs(shift) < 0.1:
+        assert status == 0, error
+        return
+    assert status == 2 and "force and motion are on two clocks" in error
+    assert f"{-shift:+.3f} s is added" in error and "write the times of leg.trc into it" in error
 
 
 def test_files_without_a_common_time_are_refused(tmp_path, capsys):

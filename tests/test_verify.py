@@ -2,15 +2,19 @@
 
 import json
 import shutil
+import zipfile
 
 import numpy as np
 import pytest
 
+from interrupted_runs import held_elsewhere
 from scenes import write_scene
+from tkamb import files
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.run.recorder import Shard, Shards
-from tkamb.run.results_folder import read_results
+from tkamb.run.results_folder import read_results, write_results
+from tkamb.show.comparison import compare_folders
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +122,7 @@ def test_changed_input_files_are_named(finished, tmp_path, capfd):
 
 
 def test_results_of_another_code_get_a_note(run, capfd, monkeypatch):
-    monkeypatch.setattr("tkamb.run.results_folder.code_identity", lambda: "other")
+    monkeypatch.setattr("tkamb.run.reproduction.code_identity", lambda: "other")
     status, output = verified(run[1], capfd)
     code = json.loads((run[1] / "summary.json").read_text())["identity"]["code of tkamb"]
     assert status == 0 and "computed by other code" in output
@@ -177,16 +181,47 @@ def test_a_symbolic_link_in_place_of_the_frames_folder_is_refused(tmp_path):
 
 
 def test_a_second_run_in_a_folder_at_the_same_time_is_refused(run, capfd):
-    from tkamb.io import claim
-
     scene, out = run
-    descriptor = claim._acquire_lock(out)  # stands for the lock of another process
-    try:
+    with held_elsewhere(out):
         assert main(["run", str(scene / "scene.toml"), "--out", str(out), "--frames", "0:1"]) == 2
-    finally:
-        claim.os.close(descriptor)
     output = capfd.readouterr().err
     assert "another tkamb is writing" in output and output.count("\n") == 1
+    assert verified(out, capfd)[0] == 0
+
+
+@pytest.mark.parametrize("command", ["verify", "methods", "view", "compare", "export"])
+def test_a_reader_changes_nothing_in_a_folder_with_a_journal(
+    run, tmp_path, capfd, monkeypatch, command
+):
+    """A journal of someone else could name the user's files."""
+    monkeypatch.setattr(files, "LONGEST_WAIT", 0.0)
+    out = run[1]
+    journal = {"written": {"results.csv": "mine.csv"}, "removed": ["summary.json", "mine.csv"]}
+    (out / files.JOURNAL).write_text(json.dumps(journal))
+    (out / "mine.csv").write_text("mine")
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    more = {
+        "view": ["--html", str(tmp_path / "page.html")],
+        "compare": [str(out), "--out", str(tmp_path / "compared")],
+        "export": ["--vtp", "--out", str(tmp_path / "maps")],
+    }
+    assert main([command, str(out), *more.get(command, [])]) == 2
+    message = capfd.readouterr().err
+    assert files.JOURNAL in message and "tkamb report" in message
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    assert main(["report", str(out)]) == 2
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+
+
+def test_a_report_completes_the_writing_of_a_killed_run(run, capfd):
+    out = run[1]
+    content = (out / "results.csv").read_bytes()
+    part = ".tkamb-0123456789ab.part"
+    (out / "results.csv").rename(out / part)
+    journal = {"written": {"results.csv": part}, "removed": ["report.html"]}
+    (out / files.JOURNAL).write_text(json.dumps(journal))
+    assert main(["report", str(out)]) == 0
+    assert (out / "results.csv").read_bytes() == content
     assert verified(out, capfd)[0] == 0
 
 
@@ -217,3 +252,62 @@ def test_a_refused_scene_leaves_no_output_folder(finished, tmp_path, capfd):
     assert main(["run", scene, "--frames", "0:2", "--out", str(out), *link]) == 2
     assert capfd.readouterr().err.count("\n") == 1
     assert not out.exists()
+
+
+def test_a_copy_in_another_folder_is_the_same_run_and_a_changed_byte_is_named(
+    finished, tmp_path, capfd
+):
+    """Scene and results are copied to another folder; then one input changes there."""
+    other = tmp_path / "home" / "b"
+    shutil.copytree(finished / "scene", other / "scene")
+    again = ["run", str(other / "scene" / "scene.toml"), "--out", str(other / "out")]
+    assert main([*again, "--frames", "0:9:4"]) == 0
+    first, second = read_results(finished / "out").summary, read_results(other / "out").summary
+    for key in ("scene_sha256", "inputs", "scene_tables"):
+        assert first[key] == second[key]
+    comparison = compare_folders([finished / "out", other / "out"])
+    assert not comparison.notes
+    ground = other / "scene" / "ground_reaction.csv"
+    ground.write_text(ground.read_text() + "\n")
+    assert main([*again, "--frames", "0:9:4"]) == 0
+    assert read_results(other / "out").summary["scene_sha256"] != first["scene_sha256"]
+    (note,) = compare_folders([finished / "out", other / "out"]).notes
+    assert "input file ground_reaction.csv" in note
+
+
+def test_compare_names_the_setting_and_the_version_that_differ(run, tmp_path):
+    shutil.copytree(run[1], tmp_path / "b")
+    results = read_results(tmp_path / "b")
+    results.summary["scene_tables"]["motion"]["cutoff_Hz"] = 5.0
+    results.summary["versions"]["numpy"] = "1.0"
+    write_results(results, tmp_path / "b")
+    notes = " ".join(compare_folders([run[1], tmp_path / "b"]).notes)
+    assert "setting motion.cutoff_Hz" in notes and "version of numpy" in notes
+
+
+def test_a_pack_is_verified_and_computed_again_elsewhere(finished, tmp_path, capfd):
+    scene, pack = str(finished / "scene" / "scene.toml"), tmp_path / "run.zip"
+    out = ["--out", str(tmp_path / "out"), "--frames", "0:9:4", "--pack", str(pack)]
+    assert main(["run", scene, *out]) == 0
+    assert main(["verify", str(pack), "--rerun"]) == 0
+    assert "computed again: 3 frames" in capfd.readouterr().out
+    with zipfile.ZipFile(pack) as archive:
+        archive.extractall(tmp_path / "elsewhere")
+    moved, motion = tmp_path / "elsewhere", tmp_path / "elsewhere" / "inputs" / "motion.csv"
+    assert main(["verify", str(moved), "--rerun", "--inputs", str(moved / "inputs")]) == 0
+    motion.write_text(motion.read_text() + "\n")
+    assert main(["verify", str(moved)]) == 1
+    assert "motion.csv has changed since it was read" in capfd.readouterr().err
+    assert main(["verify", str(moved), "--inputs", str(finished / "scene")]) == 0
+    assert main(["verify", str(moved), "--inputs", str(tmp_path / "out")]) == 2
+
+
+def test_a_second_computation_names_the_column_that_differs(finished, tmp_path, capfd):
+    shutil.copytree(finished / "out", tmp_path / "out")
+    results = read_results(tmp_path / "out")
+    results.columns["quadriceps_N"][1] *= 1.01
+    write_results(results, tmp_path / "out")
+    capfd.readouterr()
+    assert main(["verify", str(tmp_path / "out"), "--rerun"]) == 1
+    error = capfd.readouterr().err
+    assert "quadriceps_N differs by" in error and error.count("\n") == 1

@@ -1,6 +1,7 @@
 """VTK PolyData is read in every encoding that VTK writes. Truncated and other files are refused."""
 
 import base64
+import tracemalloc
 import zlib
 from itertools import product
 
@@ -150,3 +151,23 @@ def test_a_triangle_with_a_missing_point_is_refused(tmp_path):
     arrays = ARRAYS | {"connectivity": ARRAYS["connectivity"] + 1}
     with pytest.raises(InputError, match="corner that is no point"):
         read_triangles(written(tmp_path / "part.vtp", "raw", arrays=arrays))
+
+
+@pytest.mark.parametrize("mode", ["binary", "base64", "raw"])
+@pytest.mark.parametrize("name", ["points", "connectivity", "offsets"])
+@pytest.mark.parametrize("packed", [False, True])
+def test_no_array_is_unpacked_beyond_its_stated_number(mode, name, packed, tmp_path):
+    """A small compressed block may unpack to gigabytes."""
+    long = np.concatenate([ARRAYS[name].ravel(), np.zeros(3_000_000, ARRAYS[name].dtype)])
+    path = written(tmp_path / "part.vtp", mode, packed=packed, arrays=ARRAYS | {name: long})
+    counts = f'NumberOfPoints="{len(BODY.vertices)}" NumberOfPolys="{len(BODY.faces)}"'
+    content = path.read_bytes()
+    begin = content.index(b"<Piece ") + len(b"<Piece ")
+    end = content.index(b">", begin)
+    path.write_bytes(content[:begin] + counts.encode() + content[end:])
+    tracemalloc.start()
+    with pytest.raises(InputError, match="larger than the number"):
+        read_triangles(path)
+    used = tracemalloc.get_traced_memory()[1] - 8 * path.stat().st_size
+    tracemalloc.stop()
+    assert used < 8_000_000

@@ -128,6 +128,9 @@ def _add_run(commands: Any) -> None:
         action="store_true",
         help="list the files and modules used, and the time of each part",
     )
+    run.add_argument(
+        "--pack", type=Path, metavar="F.zip", help="write results, scene and inputs into an archive"
+    )
     run.add_argument("--strict", action="store_true", help="exit 1 when a frame failed")
     run.add_argument("--json", action="store_true", help="print summary.json")
     run.set_defaults(command=_run)
@@ -167,9 +170,15 @@ def _run(options: argparse.Namespace) -> int:
         if profile:
             results.summary["profile"] = profile.report(results, options.scene)
         write_results(results, directory, progress=stages.plots)
+    if options.pack:
+        from tkamb.run.reproduction import pack
+
+        say(f"pack: {options.pack}, with {pack(directory, options.pack)} input files")
     failed = [k for k, status in enumerate(results.status) if status.startswith(FAILED)]
     for k in failed:
         say(f"frame {k}: {results.status[k]}")
+    for remark in results.summary.get("remarks", []):
+        say(f"notice: {remark}")
     for question in results.summary.get("questions", []):
         say(f"question: {question}")
     if options.json:

@@ -3,22 +3,23 @@
 Reading: only regular files up to a size limit are read. A FIFO would block for ever, a device has
 no end, and a table of gigabytes is not a recording. They are refused before a byte is read.
 
-Writing: a file is written under a temporary name in the same folder, then renamed. Files that
-belong together are all written first. Then a journal lists them, and they are renamed. If the
-process is killed before the journal is written, the old files remain. If it is killed later, the
-next command that opens the folder finishes the renames (`finish_replacement`). So a folder has
-the complete old state or the complete new state.
+Writing: a file is written under a temporary name in the same folder, then renamed, so that no link
+is followed. Files that belong together are all written first. Then a journal lists them, and they
+are renamed. If the process is killed before the journal is written, the old files remain. If it is
+killed later, the next command that writes into the folder finishes the renames
+(`finish_replacement`). Readers change nothing.
 """
 
+import codecs
 import csv
 import hashlib
-import io
 import json
 import os
 import re
 import secrets
 import stat
 import tempfile
+import time as clock
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -50,6 +51,12 @@ class FileLimitSettings:
 
 FILE_LIMITS = FileLimitSettings()
 
+BYTE_ORDER_MARKS = {
+    codecs.BOM_UTF8: "utf-8-sig",
+    codecs.BOM_UTF16_LE: "utf-16",
+    codecs.BOM_UTF16_BE: "utf-16",
+}
+"""First bytes of a text file -> its encoding. Editors of Windows write them."""
 
 SAVE_AS_UTF8 = "save it as UTF-8 text"
 
@@ -123,11 +130,16 @@ def read_text(
 ) -> str:
     """Return the content of a regular text file, with line ends as `\\n`.
 
+    A byte order mark at its beginning decides the encoding.
+
     Raises:
         InputError: as `read_bytes`, or the content is not text in this encoding.
     """
+    content = read_bytes(path, limit, what=what)
+    for mark, marked in BYTE_ORDER_MARKS.items():
+        encoding = marked if content.startswith(mark) else encoding
     try:
-        text = read_bytes(path, limit, what=what).decode(encoding)
+        text = content.decode(encoding)
     except UnicodeDecodeError as error:
         raise InputError(f"cannot be read ({error})", path) from None
     return text.replace("\r\n", "\n").replace("\r", "\n")
@@ -284,27 +296,27 @@ def _kind(mode: int) -> str:
 
 
 MARKER = ".tkamb"
-"""File that marks a folder as made by tkamb (`tkamb.io.claim`). It holds the token of its temporary
-files."""
+"""File that marks a folder as made by tkamb and is locked by its writer (`tkamb.io.claim`)."""
 JOURNAL = ".tkamb-commit"
 CHOOSE_OUT = "choose another --out, or remove it"
-_PLAIN_NAME = re.compile(r"[A-Za-z0-9_.][A-Za-z0-9_.-]*")
-
-
-def folder_token(folder: Path) -> str | None:
-    """Return the token in the names of a folder's temporary files; None without a valid marker."""
-    try:
-        result = read_json(folder / MARKER)
-    except InputError:
-        return None
-    token = result.get("token") if isinstance(result, dict) else None
-    return token if isinstance(token, str) and re.fullmatch("[0-9a-f]{16}", token) else None
+OUTPUT_NAMES = frozenset(
+    (
+        *("results.csv", "results.csv-metadata.json", "summary.json", "contact.h5", "report.html"),
+        *("bands.csv", "tornado.csv", "samples.h5", "indices.csv"),
+        *("cohort.parquet", "runs.csv", "groups.csv", "cohort.json", "cohort.html"),
+        *("wear.csv", "wear.json", "wear.vtp", "worn_insert.stl", "wear.png", ".wear.npz"),
+    )
+)
+"""Names of the files that are replaced together. A journal can rename and remove no others."""
+TEMPORARY = re.compile(r"\.tkamb-[0-9a-f]{12}\.part")
+LONGEST_WAIT = 2.0
+"""s: time that a reader waits until a writer has moved its finished files into place, which takes
+milliseconds."""
 
 
 def temporary_path(folder: Path) -> Path:
-    """Return a new path for a temporary file in a folder. Its name has the folder's token."""
-    token = folder_token(folder) or "loose"
-    return folder / f".tkamb-{token}-{secrets.token_hex(6)}.part"
+    """Return a new path for a temporary file in a folder."""
+    return folder / f".tkamb-{secrets.token_hex(6)}.part"
 
 
 @contextmanager
@@ -365,10 +377,11 @@ def write_synced(path: Path, text: str) -> None:
 
 
 def write_rows(path: Path, rows: Iterable[Iterable[object]]) -> None:
-    """Write rows of cells as CSV and flush them to the disk."""
-    buffer = io.StringIO()
-    csv.writer(buffer, lineterminator="\n").writerows(rows)
-    write_synced(path, buffer.getvalue())
+    """Write rows of cells as CSV, one after the other, and flush them to the disk."""
+    with open(path, "w", encoding="utf-8", errors="backslashreplace", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(rows)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 class Replacement:
@@ -384,7 +397,8 @@ class Replacement:
         self._removed: list[str] = []
 
     def path(self, name: str) -> Path:
-        """Return the temporary path for the new version of a file."""
+        """Return the temporary path for the new version of a file of `OUTPUT_NAMES`."""
+        assert name in OUTPUT_NAMES
         return self._written.setdefault(name, temporary_path(self.folder))
 
     def current(self, name: str) -> Path:
@@ -430,29 +444,43 @@ def replaced_together(folder: Path) -> Iterator[Replacement]:
 
 
 def replacement_pending(folder: Path) -> bool:
-    """Return whether a killed process left files of a folder to be renamed."""
+    """Return whether files of a folder are still to be renamed."""
     return os.path.lexists(folder / JOURNAL)
+
+
+def check_replaced(folder: Path) -> None:
+    """Wait until a writer has moved its finished files into place. Nothing is written.
+
+    Raises:
+        InputError: the writer was killed meanwhile.
+    """
+    deadline = clock.monotonic() + LONGEST_WAIT
+    while replacement_pending(folder):
+        if clock.monotonic() > deadline:
+            what = f"a killed tkamb left finished files that are not in place ({JOURNAL})"
+            hint = f"`tkamb report {folder}`, or the same run with resume=True, completes them"
+            raise InputError(what, folder, hint)
+        clock.sleep(0.02)
 
 
 def finish_replacement(folder: Path) -> None:
     """Rename the files that a folder's journal lists. Without a journal, do nothing.
 
-    The call can be repeated, but only by one process at a time.
+    The call can be repeated, but only by the process that has claimed the folder.
 
     Raises:
-        InputError: the journal is invalid, or the folder cannot be written.
+        InputError: the journal is damaged, or the folder cannot be written.
     """
     journal = folder / JOURNAL
     if not replacement_pending(folder):
         return
-    try:
+    with undamaged(journal, "remove it"):
         content = read_json(journal)
         written, removed = dict(content["written"]), list(content["removed"])
-        names = [*written, *written.values(), *removed]
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"is not a journal of tkamb ({error})", journal, "remove it") from None
-    if not all(isinstance(name, str) and _PLAIN_NAME.fullmatch(name) for name in names):
-        raise InputError("names files outside its folder", journal, "remove it")
+        if not OUTPUT_NAMES.issuperset([*written, *removed]):
+            raise ValueError("it names a file that is not tkamb's")
+        if not all(TEMPORARY.fullmatch(name) for name in written.values()):
+            raise ValueError("it names a file that is not temporary")
     try:
         for name, temporary in written.items():
             with suppress(FileNotFoundError):  # already renamed
@@ -462,7 +490,33 @@ def finish_replacement(folder: Path) -> None:
         journal.unlink(missing_ok=True)
     except OSError as error:
         what = f"results could not be renamed ({_reason(error)})"
-        raise InputError(what, folder, "finish with `tkamb verify` on the folder") from None
+        raise InputError(what, folder, f"finish with `tkamb report {folder}`") from None
+
+
+@contextmanager
+def undamaged(path: str | Path, hint: str = "run it again") -> Iterator[None]:
+    """Raise "is damaged: what" for any failure to read a file that tkamb wrote.
+
+    This is the boundary of all readers of results and kept work: inside, content is used as tkamb
+    writes it.
+
+    Args:
+        path: the file.
+        hint: what to do.
+
+    Raises:
+        InputError: the block raises.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except MemoryError:
+        raise InputError("needs more memory than there is", path, hint) from None
+    except Exception as error:
+        words = str(error.args[0]) if isinstance(error, KeyError) and error.args else str(error)
+        lines = words.splitlines() or [type(error).__name__]
+        raise InputError(f"is damaged: {lines[0][:200]}", path, hint) from None
 
 
 def claim_directory(path: str | Path) -> Path:

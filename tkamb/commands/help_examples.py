@@ -23,8 +23,9 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "tkamb run my_knee/scene.toml",
         "tkamb run my_knee/scene.toml --contact foundation --resolution 2 --frames 0:100:5 "
         "--out out/quick",
+        "tkamb run my_knee/scene.toml --pack my_knee.zip",
     ),
-    "verify": ("tkamb verify out/my_knee", "tkamb verify out/quick"),
+    "verify": ("tkamb verify out/my_knee", "tkamb verify my_knee.zip --rerun"),
     "report": ("tkamb report out/my_knee", "tkamb report out/quick"),
     "compare": (
         "tkamb compare out/thick out/thin",
@@ -56,6 +57,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "export": (
         "tkamb export out/my_knee --sto my_knee.sto",
         "tkamb export out/my_knee --vtp --out out/maps",
+        "tkamb export out/my_knee --figures --out figures",
     ),
     "view": (
         "tkamb view out/my_knee",

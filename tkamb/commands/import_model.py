@@ -11,6 +11,7 @@ from tkamb.io.datasets import NAMES, read_dataset
 from tkamb.units import ANGLE, LENGTH
 
 if TYPE_CHECKING:
+    from tkamb.io.importing.patient import ImportedPatient
     from tkamb.io.importing.request import ImportRequest
 
 
@@ -66,7 +67,10 @@ def add_import(commands: Any) -> None:
         "--motion", type=Path, metavar="F", help="motion file of the model's coordinates"
     )
     command.add_argument(
-        "--grf", type=Path, metavar="F", help=".mot or .sto of the ground reactions"
+        "--grf",
+        type=Path,
+        metavar="F",
+        help=".mot or .sto of the ground reactions, or OpenSim's list of external loads (.xml)",
     )
     command.add_argument(
         "--grf-force",
@@ -79,6 +83,32 @@ def add_import(commands: Any) -> None:
         type=Path,
         metavar="F",
         help="standing trial, which gives the marker positions on the segments",
+    )
+    registers = command.add_mutually_exclusive_group()
+    registers.add_argument(
+        "--register",
+        dest="register",
+        action="store_true",
+        default=None,
+        help="find the marker positions on the segments together with the motion; default: where "
+        "the markers misfit the model by over 10 mm, or the knee centres by over 20 mm",
+    )
+    registers.add_argument(
+        "--no-register",
+        dest="register",
+        action="store_false",
+        default=None,
+        help="use the model's marker positions, or those of --static, in any case",
+    )
+    command.add_argument(
+        "--with",
+        dest="companions",
+        type=Path,
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="TRIAL",
+        help="recordings of the same markers on the same day, which the registration uses as well",
     )
     command.add_argument(
         "--side", choices=("right", "left"), required=True, help="side of the knee"
@@ -299,8 +329,22 @@ def _import(options: argparse.Namespace) -> int:
     patient = import_patient(import_request(options), options.out)
     markers = write_patient(patient, options.out, options.scene)
     scene = options.out / options.scene
+    if patient.registration is not None:
+        picture = scene.with_suffix(".registration.png")
+        _write_registration(patient, picture)
+        markers = (*markers, f"picture of the registration: {picture}")
     print("\n".join([*patient.report, *markers, f"scene: {scene}", f"next: tkamb check {scene}"]))
     return 0
+
+
+def _write_registration(patient: "ImportedPatient", path: Path) -> None:
+    from tkamb.files import replaced_file
+    from tkamb.show.registration_picture import draw_registration
+
+    assert patient.registration is not None
+    figure = draw_registration(patient.scene.links, patient.model_segments, patient.registration)
+    with replaced_file(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=130)
 
 
 def import_request(options: argparse.Namespace) -> "ImportRequest":
@@ -337,6 +381,8 @@ def import_request(options: argparse.Namespace) -> "ImportRequest":
         poses=_poses(options),
         without=options.without,
         static=options.static,
+        register=options.register,
+        companions=tuple(options.companions),
         meshes=_meshes(options),
         knee=options.knee,
         frames={

@@ -130,6 +130,15 @@ RULES: dict[str, tuple[Rule, ...]] = {
         Rule("--grf-force", needs=("--grf",)),
         Rule("--static", excludes=("--motion",), because=MODELS_OWN),
         Rule("--static", excludes=("--poses",), because=POSED),
+        *(
+            Rule(option, excludes=("--motion",), because=MODELS_OWN)
+            for option in ("--register", "--no-register", "--with")
+        ),
+        *(
+            Rule(option, excludes=("--poses",), because=POSED)
+            for option in ("--register", "--no-register", "--with")
+        ),
+        Rule("--with", excludes=("--no-register",), because="only a registration reads them"),
         Rule("--femoral-frame", needs=("--femoral",)),
         Rule("--insert-frame", needs=("--insert",)),
         Rule("--patella-frame", needs=("--patella",)),
@@ -186,7 +195,7 @@ RULES: dict[str, tuple[Rule, ...]] = {
         Rule("--force", needs=("--html", "--png", "--gif", "--mp4"), because=NO_OUTPUT),
     ),
     "export": (
-        Rule("--out", needs=("--vtp", "--deck"), because="--sto names its own file"),
+        Rule("--out", needs=("--vtp", "--figures", "--deck"), because="--sto names its own file"),
         Rule("--frame", needs=("--deck",)),
         Rule("--resolution", needs=("--deck",)),
         Rule("--force", excludes=("--sto",), because="--sto replaces no file"),

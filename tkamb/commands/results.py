@@ -71,12 +71,18 @@ def add_export(commands: Any) -> None:
         help="write pressure maps over time, for ParaView; needs --out",
     )
     kind.add_argument(
+        "--figures", action="store_true", help="write every plot as SVG, PDF and PNG; needs --out"
+    )
+    kind.add_argument(
         "--deck",
         choices=("ccx", "feb"),
         help="write the contact of one frame, for CalculiX or FEBio 4",
     )
     export.add_argument(
-        "--out", type=Path, metavar="DIR2", help="folder for --vtp, or file for --deck (.inp, .feb)"
+        "--out",
+        type=Path,
+        metavar="DIR2",
+        help="folder for --vtp and --figures, or file for --deck (.inp, .feb)",
     )
     export.add_argument(
         "--frame", type=int, metavar="K", help="for --deck: row of results.csv, from 0"
@@ -91,14 +97,29 @@ def add_export(commands: Any) -> None:
 
 
 def _export(options: argparse.Namespace) -> int:
-    if (options.vtp or options.deck) and not options.out:
-        hint = "--vtp --out DIR2, or --deck ccx --frame K --out F.inp"
-        raise InputError("needs --out", "--vtp" if options.vtp else "--deck", hint)
+    if (options.vtp or options.deck or options.figures) and not options.out:
+        hint = "--vtp --out DIR2, --figures --out DIR2, or --deck ccx --frame K --out F.inp"
+        name = "--deck" if options.deck else "--vtp" if options.vtp else "--figures"
+        raise InputError("needs --out", name, hint)
     if options.deck and options.frame is None:
         raise InputError("needs --frame", "--deck", "--deck ccx --frame K")
     if options.deck:
         return _export_deck(options)
+    if options.figures:
+        return _export_figures(options)
     return _export_maps(options) if options.vtp else _export_storage(options)
+
+
+def _export_figures(options: argparse.Namespace) -> int:
+    from tkamb.io.claim import claimed_directory
+    from tkamb.run.results_folder import read_results
+    from tkamb.show.figure_files import FORMATS, write_figures
+
+    results = read_results(options.folder)
+    with claimed_directory(options.out, options.force) as folder:
+        names = write_figures(results, folder)
+    print(f"{options.out}: {len(names)} figures as {', '.join(FORMATS)}")
+    return 0
 
 
 def _export_deck(options: argparse.Namespace) -> int:
@@ -149,7 +170,18 @@ def _export_maps(options: argparse.Namespace) -> int:
 def add_folder_commands(commands: Any) -> None:
     """Add `verify`, `report` and `methods` to the command line."""
     verify = commands.add_parser("verify", help="check that a folder of results is unchanged")
-    verify.add_argument("folder", type=Path, metavar="DIR", help="folder that `tkamb run` wrote")
+    verify.add_argument(
+        "folder", type=Path, metavar="DIR", help="folder that `tkamb run` wrote, or its pack (.zip)"
+    )
+    verify.add_argument(
+        "--inputs",
+        type=Path,
+        metavar="FOLDER",
+        help="folder with a copy of the scene and its files; default: that of the pack or the run",
+    )
+    verify.add_argument(
+        "--rerun", action="store_true", help="compute the run again and compare all columns"
+    )
     verify.set_defaults(command=_verify)
     report = commands.add_parser("report", help="write report.html of a folder of results again")
     report.add_argument("folder", type=Path, metavar="DIR", help="folder that `tkamb run` wrote")
@@ -163,21 +195,28 @@ def add_folder_commands(commands: Any) -> None:
 
 
 def _verify(options: argparse.Namespace) -> int:
-    from tkamb.run.results_folder import verify_results
+    from tkamb.run.reproduction import rerun, unpacked, verify_results
 
-    verdict = verify_results(options.folder)
-    for line in verdict.differs:
+    with unpacked(options.folder) as folder:
+        verdict = verify_results(folder, options.inputs)
+        differs, lines = list(verdict.differs), verdict.lines()[len(verdict.differs) :]
+        if options.rerun and not differs:
+            again = rerun(folder, options.inputs)
+            differs += again.different
+            lines.append(again.line())
+    for line in differs:
         say(f"{options.folder}: {line}")
-    for line in verdict.lines()[len(verdict.differs) :]:
+    for line in lines:
         print(f"{options.folder}: {line}")
-    return 1 if verdict.differs else 0
+    return 1 if differs else 0
 
 
 def _report(options: argparse.Namespace) -> int:
-    from tkamb.io.claim import claimed_directory
+    from tkamb.io.claim import claimed_directory, settle
     from tkamb.run.results_folder import REPORT_NAME, read_results
     from tkamb.show.report import write_report
 
+    settle(options.folder)
     results = read_results(options.folder)  # an unreadable folder must stay unchanged
     with claimed_directory(options.folder) as folder:
         write_report(results, folder / REPORT_NAME)

@@ -131,15 +131,11 @@ def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
     return 0
 
 
-QUANTITIES = {"total": "superior-inferior component"}
-"""Name of a peak -> the quantity, where it is no condyle's normal force."""
-
-
 def headline(uncertainty: "Uncertainty") -> list[str]:
     """Return lines of text: the band of the peak force and the most influential inputs."""
     from numpy import isfinite, nanargmax
 
-    from tkamb.show.headline import muscle_limits, peak_legend, peak_words, peaks_of
+    from tkamb.show.headline import limits_line, peak_lines
 
     total = uncertainty.results["force_total_BW"]
     if not isfinite(total).any():
@@ -156,15 +152,10 @@ def headline(uncertainty: "Uncertainty") -> list[str]:
             f"median {sampled_peak['median']:.2f} BW, 5 to 95 %: {sampled_peak['p05']:.2f} to "
             f"{sampled_peak['p95']:.2f}"
         )
-    peaks = peaks_of(uncertainty.results.summary)
-    lines = [
-        f"peak {name} force ({QUANTITIES.get(name, 'normal force')}): {peak_words(one)} BW"
-        for name, one in peaks.items()
-    ]
-    lines += [f"({peak_legend(peaks)})"] if peaks else []
-    lines += [f"peak total force (resultant) at {flexion:.0f} deg: {value} ({words})"]
-    limits = muscle_limits(uncertainty.results)
-    lines += [limits.line()] if limits is not None else []
+    lines = peak_lines(uncertainty.results)
+    lines += [f"peak of the resultant total force, at {flexion:.0f} deg: {value} ({words})"]
+    limits = limits_line(uncertainty.results)
+    lines += [limits] if limits is not None else []
     chance_share = TERMS / uncertainty.results.summary["uncertainty"]["samples"]
     chance = f"; up to {chance_share:.0%} each is chance" if chance_share >= LEAST_SHOWN else ""
     for result in ("force_total_N", "medial_force_N"):

@@ -231,7 +231,10 @@ class CamPost:
         # The transposed matrix transforms the wrench, so that the work is the same in both frames.
         stiffness = None if load.stiffness is None else x.T @ load.stiffness @ x
         centre = transform(inverse(self.in_turned), load.centre)
-        return CondyleWrench(x.T @ load.wrench, centre, stiffness)
+        slope = load.centre_slope
+        if slope is not None:
+            slope = self.in_turned[:3, :3].T @ slope @ x
+        return CondyleWrench(x.T @ load.wrench, centre, stiffness, slope)
 
     def _flags(self, result: ContactResult) -> tuple[str, ...]:
         loaded = transform(inverse(self.in_turned), result.points[result.pressure > 0])

@@ -11,8 +11,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from tkamb.geometry.frames import Array, Index, Mask
+from tkamb.geometry.defects import Defect
+from tkamb.geometry.frames import Array, Index, Mask, transform
 from tkamb.geometry.surface import Surface
 from tkamb.units import DEGREE, MILLIMETRE
 
@@ -55,7 +57,7 @@ def narrow_flags(
         ):
             yield (
                 f"the {side} {TOO_NARROW} for the {points}: its peak pressure cannot be "
-                f"relied on and is mostly too low; take finer {points}"
+                f"relied on; take finer {points}"
             )
 
 
@@ -189,3 +191,91 @@ def edge_of_insert_flags(
             else f"its peak pressure lies {peak / MILLIMETRE:.1f} mm from it"
         )
         yield (f"the {side} {AT_EDGE} (within {settings.reach / MILLIMETRE:g} mm); {where}")
+
+
+@dataclass(frozen=True)
+class MeshFlagSettings:
+    """When a defect of a mesh changes a contact."""
+
+    reach_cells: float = 1.5
+    """1: distance from a loaded point, in cells of the map, below which a defect is reached.
+    Chosen: a cell and its diagonal."""
+    noisy_share: float = 0.5
+    """1: share of a body's vertices in the contact that are noisy, from which it is flagged. Chosen
+    because a crease beside a contact makes fewer of them rough."""
+    bottom: float = 0.1 * MILLIMETRE
+    """m: height above the bottom up to which a column counts as standing on it. Chosen above the
+    flatness of machined bottoms."""
+
+
+MESH_FLAG = MeshFlagSettings()
+MESH_DEFECT = "the contact reaches a defect of the"
+"""Text of the flag before " <body> mesh"."""
+UNSUPPORTED = "contact lies over an unsupported bottom"
+"""Text of the flag after "the <side> "."""
+
+
+def mesh_flags(
+    bodies: Mapping[str, tuple[Surface, Array]], points: Array, area: Array, pressure: Array
+) -> Iterator[str]:
+    """Yield a flag for each kind of defect of a mesh that the contact reaches.
+
+    Args:
+        bodies: name -> surface, and its pose (4, 4) in the insert frame.
+        points: (n, 3) m, map points.
+        area: (n,) m², their areas.
+        pressure: (n,) Pa.
+    """
+    loaded = pressure > 0.0
+    if not loaded.any():
+        return
+    # Half a millimetre for the approach, which moves the femoral surface below the map points.
+    reach = MESH_FLAG.reach_cells * float(np.sqrt(np.median(area[loaded]))) + 0.5 * MILLIMETRE
+    contact = cKDTree(points[loaded])
+    for name, (surface, pose) in bodies.items():
+        reached: dict[str, list[Defect]] = {}
+        for defect in surface.defects:
+            places = transform(pose, defect.places)
+            within = contact.query(places, distance_upper_bound=reach)[0] <= reach
+            if defect.kind == "noise" and within.any():
+                own = transform(pose, surface.vertices)
+                near = contact.query(own, distance_upper_bound=reach)[0] <= reach
+                within &= within.sum() > MESH_FLAG.noisy_share * near.sum()
+            if within.any() or (defect.kind == "opening" and _below(places, points, reach)):
+                reached.setdefault(defect.kind, []).append(defect)
+        for found in reached.values():
+            more = f" and {len(found) - 1} more" if len(found) > 1 else ""
+            yield (
+                f"{MESH_DEFECT} {name} mesh, {found[0].words}{more}: pressure, area and approach "
+                "cannot be relied on; mend the mesh"
+            )
+
+
+def _below(places: Array, points: Array, reach: float) -> bool:
+    """Return whether a place (m, 3) lies beside a map point (n, 3) and below it."""
+    distance, near = cKDTree(points[:, [0, 2]]).query(places[:, [0, 2]], distance_upper_bound=reach)
+    over = np.isfinite(distance)
+    return bool((places[over, 1] < points[near[over], 1]).any())
+
+
+def unsupported_flags(
+    insert: Surface, points: Array, pressure: Array, sides: Mapping[str, Mask]
+) -> Iterator[str]:
+    """Yield a flag for each condyle with a loaded point whose column does not stand on the bottom.
+
+    A vertical ray from the point ends above the bottom there, at a pocket, a slot, a hole or an
+    overhang.
+    """
+    for side, under_side in sides.items():
+        highest = float(pressure[under_side].max(initial=0.0))
+        if highest <= 0.0:
+            continue
+        loaded = np.flatnonzero(under_side & (pressure > EDGE.share * highest))
+        start = points[loaded] - [0.0, MILLIMETRE / 100.0, 0.0]
+        below = insert.rays.first(start, DOWN)[0]
+        height = start[:, 1] - below - insert.bounds[0, 1]
+        if (np.isfinite(below) & (height > MESH_FLAG.bottom)).any():
+            yield (
+                f"the {side} {UNSUPPORTED}: the columns stand on the fixed bottom, so that "
+                "stiffness and pressure are too high there; the stated error does not apply"
+            )

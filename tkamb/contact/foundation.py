@@ -5,7 +5,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from tkamb.contact.flags import narrow_flags
+from tkamb.contact.flags import narrow_flags, unsupported_flags
 from tkamb.contact.materials import Material
 from tkamb.contact.model import CondyleWrench, ContactModel, ProbedContact
 from tkamb.contact.pressing import PRESS, press_by_search
@@ -56,7 +56,7 @@ OVER_THE_EDGE = (
 WIDEST_EDGE = NEAR
 """m: upper limit of the range of gaps in which `FoundationProbe.smoothed` counts a column partly.
 The range is the change of the gap across the column."""
-SUMS = 46
+SUMS = 70
 """Number of sums over the columns of one condyle; see `_add_up`."""
 
 
@@ -133,13 +133,15 @@ class ElasticFoundation(ContactModel):
         pressure = layer_pressure(self.law, state.pair.material, strain)
         pressure[grazing(samples, meeting)] = 0.0
         medial = medial_points(samples.points, pose, state.pair.split)
-        flags = narrow_flags(
-            samples.triangles, pressure > 0, {"medial": medial, "lateral": ~medial}, "columns"
+        sides = {"medial": medial, "lateral": ~medial}
+        flags = (
+            *unsupported_flags(state.pair.insert, samples.points, pressure, sides),
+            *narrow_flags(samples.triangles, pressure > 0, sides, "columns"),
         )
         force = forces_on_insert(samples, meeting, pressure)
         places = samples.points + np.where(pressure > 0, gap, 0.0)[:, None] * samples.normals
         return ContactResult.of(
-            state, pose, pressure, gap, force, medial=medial, places=places, flags=tuple(flags)
+            state, pose, pressure, gap, force, medial=medial, places=places, flags=flags
         )
 
     def press(
@@ -340,9 +342,10 @@ class FoundationProbe:
         condyles = {}
         for side, sums in self._sums(samples, meeting, force, rate, pose).items():
             if sums[0] > 0.0:
-                condyles[side] = CondyleWrench(
-                    -sums[4:10], sums[1:4] / sums[0], sums[10:].reshape(6, 6)
-                )
+                stiffness, centre = sums[10:46].reshape(6, 6), sums[1:4] / sums[0]
+                # The centre is sum(x F) / sum(F) over the columns.
+                slope = sums[46:64].reshape(3, 6) - np.outer(centre, sums[64:])
+                condyles[side] = CondyleWrench(-sums[4:10], centre, stiffness, slope / sums[0])
         return ProbedContact(condyles, tangent=True)
 
     def smoothed(self, pose: Array, contact: ProbedContact) -> ProbedContact:
@@ -365,7 +368,7 @@ class FoundationProbe:
         force = layer_pressure(self._law, self._state.pair.material, strain) * samples.area
         sums = self._sums(samples, within, force, self._rate(samples, within.gap) * share, pose)
         condyles = {
-            side: replace(condyle, stiffness=sums[side][10:].reshape(6, 6))
+            side: replace(condyle, stiffness=sums[side][10:46].reshape(6, 6))
             for side, condyle in contact.condyles.items()
         }
         return replace(contact, condyles=condyles)
@@ -424,7 +427,8 @@ def _add_up(
         medial: (n,) whether a column belongs to the medial condyle.
         sums: (2, `SUMS`) output for medial and lateral, to which the columns are added: force (N),
             force times point (3,) N·m, wrench on the femoral component (6,), stiffness of the
-            wrench on the insert (6, 6). The first two count the magnitude of a column's force.
+            wrench on the insert (6, 6), and of force times point (3, 6) and force (6,), by a
+            displacement. Force is the magnitude of a column's force.
     """
     met, place, change = np.empty(6), np.empty(3), np.empty((6, 6))
     for n in range(len(points)):
@@ -447,13 +451,18 @@ def _add_up(
         _turn(normals[n], curvatures[n], place, met, cosine, change)
         for i in range(6):
             side_sums[4 + i] -= size * met[i]
-            for j in range(6):
-                # Change of the cosine, n . dm.
-                turned = 0.0
-                for k in range(3):
-                    turned += normals[n, k] * change[k, j]
-                side_sums[10 + 6 * i + j] += met[i] * met[j] * (rate[n] / cosine**2)
-                side_sums[10 + 6 * i + j] += size * (change[i, j] - met[i] * turned / cosine)
+        for j in range(6):
+            turned, stretched = 0.0, 0.0  # n . dm, m . dm
+            for k in range(3):
+                turned += normals[n, k] * change[k, j]
+                stretched += met[k] * change[k, j]
+            resized = met[j] * (rate[n] / cosine**2) - size * turned / cosine
+            for i in range(6):
+                side_sums[10 + 6 * i + j] += resized * met[i] + size * change[i, j]
+            reweighed = (resized * length + size * stretched) / np.sqrt(length)
+            side_sums[64 + j] += reweighed
+            for i in range(3):
+                side_sums[46 + 6 * i + j] += reweighed * points[n, i]
 
 
 @compiled_as_written

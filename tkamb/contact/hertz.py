@@ -9,6 +9,7 @@ from scipy.optimize import brentq
 from scipy.special import ellipkm1, elliprd
 
 from tkamb.contact.curvature import OsculatingContact, osculate
+from tkamb.contact.flags import unsupported_flags
 from tkamb.contact.model import ContactModel
 from tkamb.contact.result import CondyleContact, ContactResult, Guess, peak_flags, thickness_under
 from tkamb.contact.samples import MAP_POINT, SampledContact, SurfaceSamples, gaps_along_normals
@@ -203,6 +204,9 @@ class Hertz(ContactModel):
                     f"the long semi-axis of the {SIDES[side]} contact ellipse exceeds the "
                     "thickness of the insert: Hertz assumes a half-space"
                 )
+        sides = dict(zip(SIDES, pressure > 0, strict=True))
+        total = pressure.sum(axis=0)
+        flags += unsupported_flags(state.pair.insert, samples.points, total, sides)
         return _collected(state, pose, pressure, patches, tuple(flags))
 
 

@@ -103,11 +103,14 @@ class CondyleWrench:
         stiffness: (6, 6) derivative of the wrench by a small displacement of the femoral component;
             None if it is unknown. The displacement is the translation (m) of the component's point
             at the insert's origin, then the rotation (rad).
+        centre_slope: (3, 6) derivative of the centre by the same displacement; None if it is
+            unknown. Only friction needs it.
     """
 
     wrench: Array
     centre: Array
     stiffness: Array | None = None
+    centre_slope: Array | None = None
 
     @cached_property
     def force(self) -> float:
@@ -118,6 +121,12 @@ class CondyleWrench:
     def normal(self) -> Array:
         """(3,) unit, from the insert to the femur: opposite to the force on the insert."""
         return -self.wrench[:3] / self.force
+
+    @property
+    def force_slope(self) -> Array:
+        """(6,) derivative of the magnitude of the resultant by a displacement, N/m and N/rad."""
+        assert self.stiffness is not None
+        return -self.normal @ self.stiffness[:3]
 
     @cached_property
     def point(self) -> Array:

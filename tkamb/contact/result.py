@@ -16,7 +16,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from tkamb.contact.flags import edge_of_insert_flags
+from tkamb.contact.flags import TOO_NARROW, edge_of_insert_flags, mesh_flags
 from tkamb.contact.pair import ContactPair, ContactSurface, PreparedContact
 from tkamb.geometry.frames import Array, Mask
 from tkamb.units import MEGAPASCAL, MILLIMETRE
@@ -195,6 +195,10 @@ class ContactResult:
                 {"medial": medial, "lateral": ~medial},
             ),
         )
+        bodies = {"femoral": (state.pair.femoral, pose), "insert": (state.pair.insert, np.eye(4))}
+        defects = tuple(mesh_flags(bodies, surface.points, surface.area, pressure))
+        if defects:  # finer cells do not help against a defect of the mesh
+            flags = (*defects, *(flag for flag in flags if TOO_NARROW not in flag))
         if state.pair.split is None:
             flags = (*flags, *patch_flags(surface, pressure, nodal_force))
         ending["flags"] = flags
@@ -223,8 +227,17 @@ class ContactResult:
         iterations: int = 0,
         residual: float = math.nan,
     ) -> "ContactResult":
-        """Return a result with the status OUT_OF_RANGE, NaN for all numbers, and the reasons."""
-        points = state.surface.points
+        """Return a result with the status OUT_OF_RANGE, NaN for all numbers, and the reasons.
+
+        An opening of a mesh is named, because it is a frequent reason.
+        """
+        points, pair = state.surface.points, state.pair
+        openings = [
+            f"the {name} mesh has {defect.words}"
+            for name, body in (("femoral", pair.femoral), ("insert", pair.insert))
+            for defect in body.defects
+            if defect.kind == "opening"
+        ]
         unknown, vectors = np.full(len(points), np.nan), np.full_like(points, np.nan)
         return cls(
             pair=state.pair,
@@ -242,7 +255,7 @@ class ContactResult:
             status=ContactStatus.OUT_OF_RANGE,
             iterations=iterations,
             residual=residual,
-            flags=tuple(dict.fromkeys(reasons)),
+            flags=tuple(dict.fromkeys([*reasons, *openings[:1]])),
         )
 
 

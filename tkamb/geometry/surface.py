@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     import trimesh
 
     from tkamb.geometry.curved import CurvedSurface
+    from tkamb.geometry.defects import Defect
     from tkamb.geometry.nearest import NearestPoints, TriangleTree
     from tkamb.geometry.rays import RayCaster
     from tkamb.geometry.winding import WindingNumber
@@ -216,6 +217,13 @@ class Surface:
         from tkamb.geometry.winding import WindingNumber
 
         return WindingNumber(self)
+
+    @cached_property
+    def defects(self) -> "tuple[Defect, ...]":
+        """The openings, spikes, noise and steps of the surface."""
+        from tkamb.geometry.defects import defects_of
+
+        return defects_of(self)
 
     @cached_property
     def volume(self) -> float:

@@ -1,32 +1,28 @@
 """Ownership of output folders: a folder is tkamb's own, and one process at a time writes to it.
 
-The file `.tkamb` marks a folder as tkamb's own. A process that writes holds a lock on it (flock).
-The system releases the lock when the process ends for any reason. tkamb uses a folder with foreign
+The file `.tkamb` marks a folder as tkamb's own. A process that writes locks it (filelock). The
+system releases the lock when the process ends for any reason. tkamb uses a folder with foreign
 files only if the user asks for it, and removes only its own files. The files in a folder also show
 which command wrote them. A command does not write into a folder with another command's output.
 """
 
-import fcntl
-import json
 import os
 import re
-import secrets
 import stat
-import threading
-import time as clock
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from tkamb import __version__
+from filelock import FileLock, Timeout
+
 from tkamb.errors import InputError
 from tkamb.files import (
     FILE_LIMITS,
     MARKER,
+    TEMPORARY,
     claim_directory,
     finish_replacement,
-    folder_token,
     read_json,
     read_text,
     replacement_pending,
@@ -80,22 +76,17 @@ def check_occupants(folder: Path, command: str) -> None:
 def _frames_of(folder: Path) -> tuple[str, str]:
     """Return the command of a folder's unfinished run ("" without one), and the run's file."""
     name = ".frames/run.json"
-    try:
-        result = read_json(folder / name)
-    except InputError:
-        return "", name
-    if not isinstance(result, dict):
-        return "", name
-    if "table of runs" in result:
+    content = _object(folder / name)
+    if "table of runs" in content:
         return "cohort", name
-    return ("uncertainty" if "method of sampling" in result else "run"), name
+    if "method of sampling" in content:
+        return "uncertainty", name
+    return ("run" if content else ""), name
 
 
 def _rows_of(folder: Path) -> tuple[str, str]:
     """Return the command of a folder's unfinished study ("" without one), and the study's file."""
     name = "rows.jsonl"
-    if any((folder / summary).is_file() for summary in ("tradeoff.json", "stability.json")):
-        return "", name
     try:
         first = read_text(folder / name, FILE_LIMITS.table_bytes).partition("\n")[0]
     except InputError:
@@ -106,11 +97,6 @@ def _rows_of(folder: Path) -> tuple[str, str]:
 
 
 CHOOSE = "choose another directory"
-LONGEST_WAIT = 5.0
-"""s: longest time that a reader waits while a writer moves finished files into place."""
-
-_held: set[tuple[int, int, int]] = set()
-"""(thread, device, inode) of each folder that this process has locked."""
 
 
 @contextmanager
@@ -133,21 +119,16 @@ def claimed_directory(path: str | Path, force: bool = False, command: str = "") 
     """
     path = Path(path)
     new_folders = [folder for folder in (path, *path.parents) if not _exists(folder)]
-    fresh = None
     try:
         claim_directory(path)
-        status = path.stat()
-        key = (threading.get_ident(), status.st_dev, status.st_ino)
-        if key in _held:
+        lock = FileLock(path.absolute() / MARKER, is_singleton=True)
+        if lock.is_locked:
             yield path
             return
         _check_ours(path, force)
-        fresh = not os.path.lexists(path / MARKER)
-        held_before = set(os.listdir(path))
-        with _holding_lock(path):
-            _held.add(key)
+        fresh, held_before = not os.path.lexists(path / MARKER), set(os.listdir(path))
+        with _holding(lock, path):
             try:
-                _mark(path)
                 finish_replacement(path)
                 _remove_temporaries(path)
                 if command and not force:
@@ -159,8 +140,6 @@ def claimed_directory(path: str | Path, force: bool = False, command: str = "") 
                 if fresh and set(os.listdir(path)) - {MARKER} <= held_before:
                     (path / MARKER).unlink(missing_ok=True)
                 raise
-            finally:
-                _held.discard(key)
     except InputError:
         with suppress(OSError, ValueError):  # the folder is not empty, or does not exist
             for folder in new_folders:
@@ -169,89 +148,41 @@ def claimed_directory(path: str | Path, force: bool = False, command: str = "") 
 
 
 def settle(folder: Path) -> None:
-    """Complete a killed process's file changes in a folder, which may then be read.
+    """Complete a killed process's file changes in a folder of tkamb's.
 
     Raises:
         InputError: the changes cannot be completed.
     """
-    deadline = clock.monotonic() + LONGEST_WAIT
-    while replacement_pending(folder):
-        try:
-            with _holding_lock(folder):
-                finish_replacement(folder)
-        except BusyFolderError:  # the process that has the lock completes the changes
-            if clock.monotonic() > deadline:
-                raise
-            clock.sleep(0.02)
-
-
-class BusyFolderError(InputError):
-    """Another process writes into the folder."""
+    if replacement_pending(folder):
+        with claimed_directory(folder):
+            pass
 
 
 @contextmanager
-def _holding_lock(path: Path) -> Iterator[None]:
+def _holding(lock: FileLock, path: Path) -> Iterator[None]:
     """Lock a folder's marker while the block runs; the marker is made if it does not exist."""
-    descriptor = _acquire_lock(path)
+    marker = path / MARKER
+    with suppress(FileNotFoundError):
+        status = marker.lstat()
+        if not stat.S_ISREG(status.st_mode) or status.st_nlink > 1:
+            raise InputError("is a link or no file", marker, "remove it: it is not tkamb's")
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        hint = f"wait for it, or {CHOOSE}"
+        raise InputError("another tkamb is writing into this folder", path, hint) from None
+    except OSError as error:
+        raise InputError(f"cannot be locked ({error.strerror})", marker, CHOOSE) from None
     try:
         yield
     finally:
-        os.close(descriptor)
-
-
-def _acquire_lock(path: Path) -> int:
-    marker = path / MARKER
-    while True:
-        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-        try:
-            descriptor = os.open(marker, flags, 0o644)
-        except OSError as error:
-            raise InputError(f"cannot be opened ({error.strerror})", marker, CHOOSE) from None
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(descriptor)
-            what = "another tkamb is writing into this folder"
-            raise BusyFolderError(what, path, f"wait for it, or {CHOOSE}") from None
-        except OSError as error:
-            os.close(descriptor)
-            what = f"cannot be locked ({error.strerror})"
-            raise InputError(what, marker, CHOOSE) from None
-        # The previous owner of the lock may have removed the marker. This lock is then on a
-        # removed file and excludes no other process.
-        with suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(descriptor), marker.lstat()):
-                return descriptor
-        os.close(descriptor)
-
-
-def _mark(path: Path) -> None:
-    """Write the marker's content if it is empty."""
-    if folder_token(path):
-        return
-    content = {
-        "tkamb": __version__,
-        "token": secrets.token_hex(8),
-        "note": "tkamb writes its results into this folder and may replace them",
-    }
-    marker = path / MARKER
-    try:
-        with open(
-            marker, "r+", encoding="utf-8"
-        ) as file:  # in place: the lock belongs to its inode
-            file.truncate()
-            file.write(json.dumps(content) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError as error:
-        raise InputError(f"cannot be written ({error.strerror})", marker, CHOOSE) from None
+        lock.release()
 
 
 def _remove_temporaries(path: Path) -> None:
-    """Remove the temporary files of a killed process; their names contain the folder's token."""
-    token = folder_token(path)
-    for entry in path.glob(f".tkamb-{token}-*.part"):
-        if stat.S_ISREG(entry.lstat().st_mode):
+    """Remove the temporary files of a killed process."""
+    for entry in path.iterdir():
+        if TEMPORARY.fullmatch(entry.name) and stat.S_ISREG(entry.lstat().st_mode):
             entry.unlink(missing_ok=True)
 
 
@@ -271,18 +202,12 @@ def is_ours(path: Path) -> bool:
     Releases without the marker are recognised by a summary.json with tkamb's version, by the file
     of an unfinished run, or by the rows of a study.
     """
-    if (path / MARKER).is_file() and not (path / MARKER).is_symlink():
+    if os.path.lexists(path / MARKER):
         return True
     versions = _object(path / "summary.json").get("versions")
     if isinstance(versions, dict) and "tkamb" in versions:
         return True
-    if "version of tkamb" in _object(path / ".frames" / "run.json"):
-        return True
-    try:
-        rows = read_text(path / "rows.jsonl", FILE_LIMITS.table_bytes)
-    except InputError:
-        return False
-    return rows.startswith('{"key": ') and '"row": ' in rows.partition("\n")[0]
+    return bool(_frames_of(path)[0] or _rows_of(path)[0])
 
 
 OWN_MARK = b"tkamb"

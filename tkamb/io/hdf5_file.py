@@ -5,7 +5,7 @@ process. tkamb lets the library write through a Python file object. This object 
 failure and ignores later writes. The library can then close the file, and `new_hdf5` raises.
 """
 
-import os
+import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,11 +16,12 @@ import h5py
 from tkamb.errors import InputError
 
 
-class NotingFile:
+class NotingFile(io.FileIO):
     """A file object for HDF5 that records the first failed write and raises no error.
 
     Args:
-        path: the file; it is created, or emptied if it exists.
+        path: the file. A file or link of this name is removed first, so that nothing is written
+            through a link.
 
     Attributes:
         failure: error of the first failed write; None if every write has succeeded.
@@ -30,34 +31,16 @@ class NotingFile:
     """
 
     def __init__(self, path: str | Path) -> None:
-        flags = os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
-        self._descriptor = os.open(path, flags, 0o666)
-        self._place = 0
+        Path(path).unlink(missing_ok=True)
+        super().__init__(path, "x+b")
         self.failure: OSError | None = None
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Move to a position and return it, in bytes from the beginning."""
-        start = {os.SEEK_SET: 0, os.SEEK_CUR: self._place, os.SEEK_END: self._size()}[whence]
-        self._place = start + offset
-        return self._place
-
-    def tell(self) -> int:
-        """Return the current position, in bytes from the beginning."""
-        return self._place
-
-    def read(self, size: int) -> bytes:
-        """Return `size` bytes from the current position, zeros beyond the end of the file."""
-        buffer = bytearray(size)
-        self.readinto(buffer)
-        return bytes(buffer)
 
     def readinto(self, buffer: Any) -> int:
         """Fill a buffer from the current position; bytes beyond the end of the file are zero."""
         view = memoryview(buffer).cast("B")
-        content = os.pread(self._descriptor, len(view), self._place)
-        view[: len(content)] = content
-        view[len(content) :] = bytes(len(view) - len(content))
-        self._place += len(view)
+        count = super().readinto(view) or 0
+        view[count:] = bytes(len(view) - count)
+        self.seek(len(view) - count, io.SEEK_CUR)
         return len(view)
 
     def write(self, content: Any) -> int:
@@ -66,33 +49,20 @@ class NotingFile:
         written = 0
         while written < len(view) and self.failure is None:
             try:
-                written += os.pwrite(self._descriptor, view[written:], self._place + written)
+                written += super().write(view[written:]) or 0
             except OSError as error:
                 self.failure = error
-        self._place += len(view)
+        self.seek(len(view) - written, io.SEEK_CUR)
         return len(view)
 
     def truncate(self, size: int | None = None) -> int:
         """Set the length of the file, bytes; default: the current position."""
-        size = self._place if size is None else size
+        size = self.tell() if size is None else size
         try:
-            if self.failure is None:
-                os.ftruncate(self._descriptor, size)
+            return size if self.failure is not None else super().truncate(size)
         except OSError as error:
             self.failure = error
-        return size
-
-    def flush(self) -> None:
-        """Do nothing: this object has no buffer."""
-
-    def close(self) -> None:
-        """Close the file."""
-        if self._descriptor >= 0:
-            os.close(self._descriptor)
-            self._descriptor = -1
-
-    def _size(self) -> int:
-        return os.fstat(self._descriptor).st_size
+            return size
 
 
 @contextmanager
@@ -109,12 +79,10 @@ def new_hdf5(path: Path) -> Iterator[Any]:
         stream = NotingFile(path)
     except OSError as error:
         raise InputError(f"cannot be written ({error.strerror})", path) from None
-    try:
+    with stream:
         with h5py.File(stream, "w") as file:
             yield file
         check_written(stream, path)
-    finally:
-        stream.close()
 
 
 def check_written(stream: NotingFile, path: object) -> None:

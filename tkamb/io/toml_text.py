@@ -70,7 +70,7 @@ def parse_toml(text: str, where: object) -> dict[str, Any]:
     """
     check_limits(text, where)
     try:
-        return tomllib.loads(text)
+        return tomllib.loads(text.removeprefix("\ufeff"))  # a byte order mark of an editor
     except (ValueError, RecursionError) as error:  # the parser's own error is a ValueError
         raise InputError(
             f"is not TOML ({str(error)[:200]})", where, "correct that line, or give a TOML file"

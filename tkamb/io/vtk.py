@@ -90,7 +90,7 @@ def write_map_series(maps: "ContactMaps", folder: Path) -> list[str]:
     Raises:
         InputError: no frame has a map, or the folder cannot be written.
     """
-    mapped_frames = np.flatnonzero(np.isfinite(maps.pressure_Pa).all(axis=1))
+    mapped_frames = np.flatnonzero(np.isfinite(maps.peaks_Pa))
     if not len(mapped_frames):
         raise InputError("no frame has a pressure map", "export --vtp")
     root = Element("VTKFile", type="Collection", version="1.0", byte_order="LittleEndian")

@@ -18,7 +18,8 @@ from tkamb.geometry.frames import (
 )
 from tkamb.knee.anatomy import find_anatomy
 from tkamb.knee.canonical import Bridge, CanonicalChain, KneePose, se3
-from tkamb.knee.muscles import Muscle, checked_tensions, tension_lines
+from tkamb.knee.load import PointForces
+from tkamb.knee.muscles import Muscle, TensionLine, checked_tensions, tension_lines
 from tkamb.knee.parts import (
     Extensor,
     Implant,
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     from tkamb.geometry.closest import ClosestPointQuery
     from tkamb.knee.contact import KneeContact
     from tkamb.knee.extensor import ExtensorLines
-    from tkamb.knee.ligaments import Ligament
+    from tkamb.knee.ligaments import BundleArrays, Ligament
     from tkamb.knee.patella import PatellaState
 
 PATELLAR_LIGAMENT = "patellar_ligament"
@@ -174,9 +175,64 @@ class AssembledKnee:
         """
         return self._kinematics(self.create_data_for_kinematics(), q).coordinates
 
-    def at(self, q: Array, data: KneeData) -> KneePose:
-        """Return the pose of the knee at q, and update the placements in `data`."""
-        return self._kinematics(data, q)
+    def at(self, q: Array, data: KneeData, v: Array | None = None) -> KneePose:
+        """Return the pose of the knee at q, and update the placements in `data`.
+
+        With a velocity v (nv,), the velocities in `data` are updated, too.
+        """
+        return self._kinematics(data, q, v)
+
+    @property
+    def crossing(self) -> "BundleArrays | None":
+        """The ligaments between femur and tibia; None: there are none."""
+        return self._crossing
+
+    @property
+    def muscle_lines(self) -> dict[str, TensionLine]:
+        """Name of each muscle of given tension -> its line."""
+        return self._lines
+
+    def checked_tensions(self, tensions: Mapping[str, float] | float | None) -> dict[str, float]:
+        """Return muscle -> tension, N, after a check; see `Knee.external_forces`."""
+        return self._tensions(tensions)
+
+    def loads_patella(self, tensions: Mapping[str, float]) -> bool:
+        """Return whether the extensor mechanism pulls, or a ligament ends on the patella."""
+        return bool(self._others) or self._pulls(tensions)
+
+    def patella_at(self, kinematics: KneePose, data: KneeData) -> "PatellaState":
+        """Return the patella at a pose of the knee, from q or by its equilibrium."""
+        return self._find_patella(kinematics, data)
+
+    def loads_beside(
+        self,
+        kinematics: KneePose,
+        patella: "PatellaState | None",
+        tensions: Mapping[str, float],
+    ) -> list[PointForces]:
+        """Return the loads of the extensor mechanism, and of ligaments that end on the patella.
+
+        Args:
+            kinematics: pose of the knee.
+            patella: the patella at this pose; None: not modelled.
+            tensions: muscle -> tension, N.
+        """
+        poses, total = self._link_poses(kinematics, patella), list[PointForces]()
+        if self._others:
+            from tkamb.knee.ligaments import ligament_loads
+
+            total += ligament_loads(self._others, poses)[1]
+        if self._pulls(tensions):
+            assert patella is not None and self.extensor_lines is not None
+            quadriceps = tensions[self._extensor_names[0]]
+            total += self.extensor_lines.pull(
+                poses,
+                patella,
+                kinematics.coordinates[5],
+                quadriceps,
+                tensions.get(PATELLAR_LIGAMENT),
+            )
+        return total
 
     def relative_jacobian(self, q: Array, data: KneeData | None = None) -> Array:
         """Return J (6, nv): J v is the femoral component's twist against the insert.

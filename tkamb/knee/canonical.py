@@ -442,20 +442,35 @@ class Bridge:
         """
         forces = [pin.Force.Zero() for _ in range(self.anatomy.model.njoints)]
         insert = data.oMi[self.insert.joint] * self.insert.placement
-        patella = self.anatomy.patella
-        joints = {
-            "tibia": self.insert.joint,
-            "femur": self.component.joint,
-            "patella": self.component.joint if patella is None else patella.joint,
-        }
         for link, wrench in summed(loads).items():
-            joint = joints[link]
+            joint = self.joint_of(link)
             user_wrench = mirrored_spatial(wrench) if self.left else wrench
             forces[joint] += data.oMi[joint].actInv(insert).act(pin.Force(user_wrench))
         return pin.StdVec_Force(forces)
 
+    def joint_of(self, link: str) -> int:
+        """Return the user's joint that carries a link; a missing patella is part of the femur."""
+        patella = self.anatomy.patella
+        if link == "patella" and patella is not None:
+            return patella.joint
+        return self.insert.joint if link == "tibia" else self.component.joint
+
+    def to_joint(self, data: Any, link: str) -> Array:
+        """Return the matrix (6, 6) that maps a force from the insert frame to a link's joint.
+
+        Args:
+            data: Pinocchio data of the user's model, with joint placements up to date.
+            link: name of the link.
+        """
+        insert = data.oMi[self.insert.joint] * self.insert.placement
+        return np.asarray(data.oMi[self.joint_of(link)].actInv(insert).toDualActionMatrix())
+
     def _placed(self, pose: Array) -> pin.SE3:
         return se3(mirrored_pose(pose) if self.left else pose)
+
+    def of_right_knee(self, placement: pin.SE3) -> Array:
+        """Return a placement as a pose (4, 4); that of a left knee is mirrored."""
+        return self._right(placement)
 
     def _right(self, placement: pin.SE3) -> Array:
         pose = placement.homogeneous

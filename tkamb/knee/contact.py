@@ -132,6 +132,46 @@ class KneeContact:
             contact_point.point, contact_point.normal - contact_point.direction(self.friction)
         )
 
+    def _friction_stiffness(self, load: CondyleWrench, twist: Array) -> Array:
+        """Return the derivative (6, 6) of a condyle's friction by a displacement, at a twist.
+
+        The force is mu N t/s in the notation of `damping`. N, the normal n and the contact point p
+        change with the wrench (f, m) and the centre c of the pressure: with m_c = m - c x f,
+
+            dN = -n . df,    dn = -(df + n dN)/N,    p = c + f x m_c/N².
+        """
+        assert load.stiffness is not None and load.centre_slope is not None
+        force, size, normal, point = load.wrench[:3], load.force, load.normal, load.point
+        by_force, by_moment, centre = load.stiffness[:3], load.stiffness[3:], load.centre_slope
+        by_size = load.force_slope
+        by_normal = -(by_force + np.outer(normal, by_size)) / size
+        moment = load.wrench[3:] - cross(load.centre, force)
+        by_moment = (
+            by_moment + _cross_matrix(force) @ centre - _cross_matrix(load.centre) @ by_force
+        )
+        turned = _cross_matrix(force) @ by_moment - _cross_matrix(moment) @ by_force
+        by_point = (
+            centre + turned / size**2 - 2.0 / size**3 * np.outer(cross(force, moment), by_size)
+        )
+        sliding = twist[:3] + cross(twist[3:], point)
+        by_sliding = _cross_matrix(twist[3:]) @ by_point
+        along = float(sliding @ normal)
+        tangential = sliding - along * normal
+        # Product rule for t = s - (s . n) n.
+        by_tangential = (
+            by_sliding
+            - np.outer(normal, normal @ by_sliding + sliding @ by_normal)
+            - along * by_normal
+        )
+        speed = float(np.sqrt(tangential @ tangential + CONTACT_POINT.standstill_speed**2))
+        direction = self.friction * tangential / speed
+        by_direction = self.friction * (
+            by_tangential / speed - np.outer(tangential, tangential @ by_tangential) / speed**3
+        )
+        change = np.outer(direction, by_size) + size * by_direction
+        by_moment = _cross_matrix(point) @ change - size * _cross_matrix(direction) @ by_point
+        return np.vstack([change, by_moment])
+
     def damping(self, contact: ProbedContact, twist: Array) -> Array:
         """Return the derivative (6, 6) of the wrench on the insert with respect to the twist.
 
@@ -164,17 +204,19 @@ class KneeContact:
             twist: constant twist of the femur, shape (6,).
             exact: True: central differences replace an approximate tangent of the model.
         """
-        # The friction force rotates with the contact normal. The model's tangent does not contain
-        # this effect, so the exact stiffness with friction needs finite differences.
         has_friction = bool(self.friction and np.any(twist) and contact.loads)
-        if contact.tangent and not (exact and (has_friction or not contact.exact)):
+        # The friction force moves with the centre of pressure. If its derivative is unknown, the
+        # exact stiffness needs finite differences.
+        moves = all(load.centre_slope is not None for load in contact.loads)
+        if contact.tangent and not (exact and ((has_friction and not moves) or not contact.exact)):
             total = np.zeros((6, 6))
             for load in contact.loads:
                 assert load.stiffness is not None
                 total += load.stiffness
-                if has_friction:
-                    normal_stiffness = -load.normal @ load.stiffness[:3]
-                    total += np.outer(self._friction_wrench(load, twist), normal_stiffness)
+                if has_friction and load.centre_slope is not None:
+                    total += self._friction_stiffness(load, twist)
+                elif has_friction:
+                    total += np.outer(self._friction_wrench(load, twist), load.force_slope)
             return total
         precise = self.precise_probe(getattr(probe, "start", None))
         self.at(precise, femur_pose)

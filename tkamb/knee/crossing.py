@@ -130,6 +130,7 @@ class MuscleShare:
         crossing: indices of the c muscles across the knee, without the extensor group, shape (c,).
         lines: lines of action of these c muscles.
         status: "ok" or "failed: …".
+        both_loaded: whether the forces keep the least share of load on each condyle, if required.
     """
 
     muscles: tuple[str, ...]
@@ -142,6 +143,7 @@ class MuscleShare:
     crossing: np.ndarray
     lines: CrossingLines
     status: str = "ok"
+    both_loaded: bool = True
 
     def loads(self, state: "ChainState") -> tuple[PointForces, ...]:
         """Return the loads of the crossing muscles and the knee's reserve on tibia and femur."""
@@ -228,13 +230,13 @@ def yielding_flexion_row(
         ComputationError: the equations of the patella are singular.
     """
     state = geometry.state
-    ratio, constant = _tension_by_ligament(geometry)
+    ratio, constant = tension_by_ligament(geometry)
     gains = ratio * lines.unit_wrenches(state.pose("tibia"), state.pose("femur")) @ per_wrench
     slope = ratio * float(per_wrench[3:] @ unknowns.AXES["ml"])
     return _solved_for_reserve(ratio * base + constant, gains, slope)
 
 
-def _tension_by_ligament(geometry: KneeGeometry) -> tuple[float, float]:
+def tension_by_ligament(geometry: KneeGeometry) -> tuple[float, float]:
     """Return a (1) and b (N) of Q = a T + b from the three equations of the patella."""
     extensor, state = geometry.extensor, geometry.state
     assert extensor is not None

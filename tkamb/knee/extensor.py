@@ -78,9 +78,17 @@ class ExtensorLines:
         self._check_fixed_ends()
         self.mechanism, self.prepared = self._build_mechanism()
 
-    def given(self, pose: Array, coordinates: Array) -> PatellaState:
-        """Return the patella at given coordinates (3,) with the femur at a pose (4, 4)."""
-        contact = self.mechanism.contact.at(coordinates)
+    def given(
+        self, pose: Array, coordinates: Array, contact: PatellarContact | None = None
+    ) -> PatellaState:
+        """Return the patella at given coordinates (3,) with the femur at a pose (4, 4).
+
+        Args:
+            pose: pose of the femur in the insert frame.
+            coordinates: coordinates of the patella, m and rad.
+            contact: the patellofemoral contact at these coordinates; None: it is computed.
+        """
+        contact = self.mechanism.contact.at(coordinates) if contact is None else contact
         return patella_at(self.mechanism, pose, coordinates, contact)
 
     def solved(

@@ -50,7 +50,11 @@ class SharingMuscles(Protocol):
         """Return the force of each muscle at a fixed pose of the knee."""
 
     def share_of_yielding_knee(
-        self, geometry: KneeGeometry, base: float, per_wrench: Array
+        self,
+        geometry: KneeGeometry,
+        base: float,
+        per_wrench: Array,
+        points: Mapping[str, Array] | None = None,
     ) -> "MuscleShare":
         """Return the force of each muscle; the released coordinates depend on these forces."""
 

@@ -18,10 +18,11 @@ import pinocchio as pin
 from tkamb.errors import ComputationError, InputError, names_near
 from tkamb.geometry.frames import (
     KNEE_COORDINATES,
+    SIDES,
     Array,
     knee_pose,
 )
-from tkamb.knee.assembled import PATELLAR_LIGAMENT, AssembledKnee, KneeData
+from tkamb.knee.assembled import AssembledKnee, KneeData
 from tkamb.knee.canonical import KneePose, mirrored_spatial, summed
 from tkamb.knee.contact_points import NO_CONTACT
 from tkamb.knee.equations import KneeGeometry
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from tkamb.contact.model import ProbedContact
     from tkamb.contact.result import ContactResult, Guess, WarmStart
     from tkamb.knee.released import KneeEquilibrium
+    from tkamb.knee.solution_derivatives import EquilibriumDerivatives, PressDerivatives
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +52,7 @@ class Equilibrium:
             25 mm).
         problem: reason why there is no equilibrium; empty: there is an equilibrium.
         search: details of the search.
+        derivatives: derivatives of the equilibrium; None: not asked for, or no equilibrium.
     """
 
     q: Array
@@ -60,6 +63,7 @@ class Equilibrium:
     stiffness: Array
     problem: str
     search: "KneeEquilibrium"
+    derivatives: "EquilibriumDerivatives | None" = None
 
 
 class Knee(AssembledKnee):
@@ -111,8 +115,8 @@ class Knee(AssembledKnee):
         massless here: it transmits the quadriceps' tension to patellar ligament and femur.
 
         Args:
-            q: configuration, shape (nq,).
-            v: velocity, shape (nv,).
+            q: configuration, shape (nq,); or (n, nq) for n configurations.
+            v: velocity, shape (nv,); or (n, nv).
             tensions: muscle -> tension, N; or the tension of the quadriceps alone, N. Muscles
                 without a tension are slack. If "patellar_ligament" is given with the quadriceps, as
                 in `KneeLoads.tensions`, the patellofemoral force balances these two tensions.
@@ -120,17 +124,21 @@ class Knee(AssembledKnee):
 
         Returns:
             `pin.StdVec_Force`, one per joint in its joint's frame: `fext` of `pin.rnea` and
-            `pin.aba`.
+            `pin.aba`. For n configurations an array (n, njoints, 6).
 
         Raises:
             InputError: q or v has the wrong size, or a muscle is unknown.
             ComputationError: the contact model is out of its range, or the patella is not found.
         """
         data = self.create_data() if data is None else data
+        if np.ndim(q) == 2:
+            from tkamb.knee.batches import forces_of_all
+
+            return forces_of_all(self, q, v, tensions, data)
         kinematics = self._kinematics(data, q, v)
         on_insert = np.zeros(6)
         if self.contact is not None:
-            contact = self._contact_at(data, kinematics)
+            contact = self.contact_at(data, kinematics)
             on_insert = self.contact.wrench(contact, self.bridge.twist(data.data))
         if self._crossing is not None:
             on_insert = on_insert + self._crossing.wrench(kinematics.pose)
@@ -144,27 +152,33 @@ class Knee(AssembledKnee):
         self, data: KneeData, kinematics: KneePose, muscle_tensions: Mapping[str, float]
     ) -> list[PointForces]:
         """Return the loads of the extensor mechanism, and of ligaments that end on the patella."""
-        pulls, patella = self._pulls(muscle_tensions), None
-        if not self._others and not pulls:
+        if not self.loads_patella(muscle_tensions):
             return []
-        if self.extensor_lines is not None:
-            patella = self._find_patella(kinematics, data)
-        poses, total = self._link_poses(kinematics, patella), list[PointForces]()
-        if self._others:
-            from tkamb.knee.ligaments import ligament_loads
+        patella = None if self.extensor_lines is None else self._find_patella(kinematics, data)
+        return self.loads_beside(kinematics, patella, muscle_tensions)
 
-            total += ligament_loads(self._others, poses)[1]
-        if pulls:
-            assert patella is not None and self.extensor_lines is not None
-            quadriceps = muscle_tensions[self._extensor_names[0]]
-            total += self.extensor_lines.pull(
-                poses,
-                patella,
-                kinematics.coordinates[5],
-                quadriceps,
-                muscle_tensions.get(PATELLAR_LIGAMENT),
-            )
-        return total
+    def condyle_forces(self, q: Array, data: KneeData | None = None) -> tuple[Array, Array]:
+        """Return the contact forces (2,), N, of medial and lateral condyle, and their derivative.
+
+        A force is the magnitude of the condyle's resultant, without friction, at the overlap of q.
+        The derivative (2, nv) by q is in the tangent space, N/m and N/rad.
+
+        Raises:
+            InputError: the knee has no contact model, or the model has no exact tangent.
+            ComputationError: the contact model is out of its range.
+        """
+        contact, data = self._need_contact(), self.create_data() if data is None else data
+        twists = self.relative_jacobian(q, data)
+        twists = mirrored_spatial(twists.T).T if self.left else twists
+        probed = self.contact_at(data, self.at(q, data))
+        if not (probed.tangent and probed.exact):
+            raise InputError(f"{contact.model.name} has no exact tangent", "condyle_forces")
+        forces, slopes = np.zeros(2), np.zeros((2, self.model.nv))
+        for k, side in enumerate(SIDES):
+            if side in probed.condyles:
+                forces[k] = probed.condyles[side].force
+                slopes[k] = probed.condyles[side].force_slope @ twists
+        return forces, slopes
 
     def stiffness(
         self, q: Array, v: Array, data: KneeData | None = None, exact: bool = True
@@ -191,9 +205,9 @@ class Knee(AssembledKnee):
         total = np.zeros((6, 6))
         if self.contact is not None:
             twist = self.bridge.twist(data.data)
-            contact = self._contact_at(data, kinematics)
+            contact = self.contact_at(data, kinematics)
             total += self.contact.stiffness(data.probe, kinematics.pose, contact, twist, exact)
-        total += self._ligament_stiffness(kinematics)
+        total += self.crossing_stiffness(kinematics)
         return self._mirrored_matrix(total)
 
     def damping(self, q: Array, v: Array, data: KneeData | None = None) -> Array:
@@ -206,8 +220,148 @@ class Knee(AssembledKnee):
         kinematics = self._kinematics(data, q, v)
         if self.contact is None:
             return np.zeros((6, 6))
-        contact = self._contact_at(data, kinematics)
+        contact = self.contact_at(data, kinematics)
         return self._mirrored_matrix(self.contact.damping(contact, self.bridge.twist(data.data)))
+
+    def external_forces_derivatives(
+        self,
+        q: Array,
+        v: Array,
+        tensions: Mapping[str, float] | float | None = None,
+        data: KneeData | None = None,
+    ) -> tuple[Array, Array]:
+        """Return the derivatives of `external_forces` by q and by v.
+
+        The equations are in `tkamb.knee.derivatives`. The derivative is total: it contains the
+        rotation of the forces with the bodies. Use it with `pin.computeABADerivatives`, which holds
+        the forces constant in the joints' frames.
+
+        Args:
+            q: configuration, shape (nq,).
+            v: velocity, shape (nv,).
+            tensions: muscle tensions, see `external_forces`.
+            data: data from `create_data`, to save time.
+
+        Returns:
+            df_dq and df_dv, each (njoints, 6, nv), in the tangent space of q: derivative of each
+            joint's force in its joint's frame, N and N·m per m, rad, m/s or rad/s.
+
+        Raises:
+            InputError: see `external_forces`.
+            ComputationError: see `external_forces`.
+        """
+        from tkamb.knee.derivatives import force_derivatives
+
+        return force_derivatives(self, q, v, tensions, self.create_data() if data is None else data)
+
+    def forward_dynamics(
+        self,
+        q: Array,
+        v: Array,
+        tau: Array,
+        fext: Any = None,
+        tensions: Mapping[str, float] | float | None = None,
+        data: KneeData | None = None,
+    ) -> Array:
+        """Return the acceleration (nv,): `pin.aba` with the forces of `external_forces`.
+
+        Args:
+            q: configuration, shape (nq,).
+            v: velocity, shape (nv,).
+            tau: torques and forces of the joints, shape (nv,), N·m and N.
+            fext: other external forces on the joints, as `fext` of `pin.aba`; None: zero.
+            tensions: muscle tensions, see `external_forces`.
+            data: data from `create_data`, to save time.
+
+        Raises:
+            InputError: see `external_forces`.
+            ComputationError: see `external_forces`.
+        """
+        data = self.create_data() if data is None else data
+        forces = self._with_external(self.external_forces(q, v, tensions, data), fext)
+        return np.array(pin.aba(self.model, data.data, q, v, self._check_tau(tau), forces))
+
+    def forward_dynamics_derivatives(
+        self,
+        q: Array,
+        v: Array,
+        tau: Array,
+        fext: Any = None,
+        tensions: Mapping[str, float] | float | None = None,
+        data: KneeData | None = None,
+    ) -> tuple[Array, Array, Array]:
+        """Return da_dq, da_dv and da_dtau (nv, nv) of `forward_dynamics`, in the tangent space.
+
+        `fext` is constant in the joints' frames. The arguments are those of `forward_dynamics`.
+
+        Raises:
+            InputError: see `external_forces`.
+            ComputationError: see `external_forces`.
+        """
+        from tkamb.knee.derivatives import generalised
+
+        data = self.create_data() if data is None else data
+        model, pin_data = self.model, data.data
+        forces = self._with_external(self.external_forces(q, v, tensions, data), fext)
+        by_q, by_v = self.external_forces_derivatives(q, v, tensions, data)
+        # Pinocchio's derivatives change the Jacobians in `data`.
+        change, rate = (generalised(model, pin_data, one) for one in (by_q, by_v))
+        pin.computeABADerivatives(model, pin_data, q, v, self._check_tau(tau), forces)
+        inverse_mass = np.array(pin_data.Minv)
+        return (
+            pin_data.ddq_dq + inverse_mass @ change,
+            pin_data.ddq_dv + inverse_mass @ rate,
+            inverse_mass,
+        )
+
+    def inverse_dynamics_derivatives(
+        self,
+        q: Array,
+        v: Array,
+        a: Array,
+        fext: Any = None,
+        tensions: Mapping[str, float] | float | None = None,
+        data: KneeData | None = None,
+    ) -> tuple[Array, Array, Array]:
+        """Return the derivatives of `pin.rnea` with the forces of `external_forces`.
+
+        The joint torques are tau = pin.rnea(model, data, q, v, a, fext), with the knee's forces.
+
+        Args:
+            q: configuration, shape (nq,).
+            v: velocity, shape (nv,).
+            a: acceleration, shape (nv,).
+            fext: other external forces, constant in the joints' frames; None: zero.
+            tensions: muscle tensions, see `external_forces`.
+            data: data from `create_data`, to save time.
+
+        Returns:
+            dtau_dq, dtau_dv and dtau_da, each (nv, nv), in the tangent space of q.
+
+        Raises:
+            InputError: see `external_forces`.
+            ComputationError: see `external_forces`.
+        """
+        from tkamb.knee.derivatives import generalised
+
+        data = self.create_data() if data is None else data
+        model, pin_data = self.model, data.data
+        forces = self._with_external(self.external_forces(q, v, tensions, data), fext)
+        by_q, by_v = self.external_forces_derivatives(q, v, tensions, data)
+        change, rate = (generalised(model, pin_data, one) for one in (by_q, by_v))
+        a = self._check(a, "a", model.nv)
+        by_q, by_v, by_a = pin.computeRNEADerivatives(model, pin_data, q, v, a, forces)
+        mass = np.triu(by_a) + np.triu(by_a, 1).T
+        return by_q - change, by_v - rate, mass
+
+    def _with_external(self, forces: Any, fext: Any) -> Any:
+        if fext is None:
+            return forces
+        self._check_external(fext)
+        return pin.StdVec_Force([f + e for f, e in zip(forces, fext, strict=True)])
+
+    def _check_tau(self, tau: Array) -> Array:
+        return self._check(tau, "tau", self.model.nv)
 
     def inverse_dynamics(
         self,
@@ -260,24 +414,51 @@ class Knee(AssembledKnee):
     def press(
         self,
         q: Array,
-        load: float,
+        load: float | Array,
         guess: "Guess | None" = None,
-    ) -> "ContactResult":
+        derivatives: bool = False,
+    ) -> Any:
         """Return the contact under a load, at the rotations, AP and ML of q.
 
         Args:
-            q: configuration, shape (nq,).
-            load: compressive force along the insert's y axis, 0 or more, N.
+            q: configuration, shape (nq,); or (n, nq) for n poses.
+            load: compressive force along the insert's y axis, 0 or more, N; or one per pose, (n,).
             guess: an earlier result or a warm start, to save time.
+            derivatives: whether the derivatives by load and pose are returned, too.
 
         Returns:
-            Pressure, area and forces of both condyles, in the insert frame of a right knee: a
-            left knee is computed as its mirror image (z to -z).
+            A `ContactResult`: pressure, area and forces of both condyles, in the insert frame of a
+            right knee: a left knee is computed as its mirror image (z to -z). With derivatives, it
+            and `tkamb.knee.solution_derivatives.PressDerivatives`. For n poses a
+            `tkamb.knee.batches.PressBatch`.
 
         Raises:
-            InputError: the knee has no contact model, or the load is negative or not finite.
+            InputError: the knee has no contact model, the load is negative or not finite, or
+                derivatives are asked of a contact model without an exact tangent.
         """
-        return self.press_from(q, load, guess)[0]
+        if np.ndim(q) == 2:
+            from tkamb.knee.batches import press_all
+
+            return press_all(self, q, load, guess, derivatives)
+        result, start = self.press_from(q, float(load), guess)
+        return (result, self.press_slopes(result, start)) if derivatives else result
+
+    def press_slopes(self, result: "ContactResult", start: "WarmStart") -> "PressDerivatives":
+        """Return the derivatives of a press from its result and warm start.
+
+        Raises:
+            InputError: the contact model has no exact tangent.
+            ComputationError: the press failed.
+        """
+        from tkamb.knee.solution_derivatives import exact_tangent, press_derivatives
+
+        contact = self._need_contact()
+        if result.status.value == "out_of_range":
+            raise ComputationError("; ".join(result.flags), "press")
+        probed = contact.probe(start).seen(result, start)
+        exact_tangent(probed, contact.model.name)
+        slopes = press_derivatives(contact.pair, result.pose, probed)
+        return replace(slopes, by_pose=mirrored_spatial(slopes.by_pose)) if self.left else slopes
 
     def press_from(
         self, q: Array, load: float, start: "Guess | None" = None
@@ -313,6 +494,7 @@ class Knee(AssembledKnee):
         released: Sequence[str] = ("ap", "ml", "axial_rotation", "adduction"),
         tensions: Mapping[str, float] | None = None,
         data: KneeData | None = None,
+        derivatives: bool = False,
     ) -> Equilibrium:
         """Return the pose at which the released coordinates are in equilibrium, with its loads.
 
@@ -328,10 +510,14 @@ class Knee(AssembledKnee):
             released: some of "ap", "ml", "axial_rotation", "adduction"; "si" is always released.
             tensions: muscle tensions, see `inverse_dynamics`.
             data: data from `create_data`, to save time.
+            derivatives: whether the result has the derivatives of coordinates and condyle forces by
+                load, prescribed coordinates, slack lengths and stiffnesses
+                (`tkamb.knee.solution_derivatives`).
 
         Raises:
-            InputError: a coordinate is unknown, the knee has no contact model, or the joints
-                between tibia and femur have too few degrees of freedom for the pose.
+            InputError: a coordinate is unknown, the knee has no contact model, the joints between
+                tibia and femur have too few degrees of freedom for the pose, or derivatives are
+                asked of a contact model without an exact tangent.
             ComputationError: the femur does not lie over the insert.
         """
         from tkamb.knee.released import ReleasedKnee
@@ -356,6 +542,9 @@ class Knee(AssembledKnee):
                 knee.geometry, knee.coordinates, knee.contact.condyles, points
             )
         loads = self._solved(instant, geometry, data)
+        slopes = None
+        if derivatives and not knee.problem:
+            slopes = self._equilibrium_derivatives(search, instant, knee, points)
         return Equilibrium(
             q_end,
             knee.coordinates,
@@ -365,7 +554,20 @@ class Knee(AssembledKnee):
             knee.balance.stiffness,
             knee.problem,
             knee,
+            slopes,
         )
+
+    def _equilibrium_derivatives(
+        self, search: Any, instant: Instant, knee: "KneeEquilibrium", points: dict[str, Array]
+    ) -> "EquilibriumDerivatives":
+        from tkamb.knee.solution_derivatives import ImplicitEquilibrium, exact_tangent
+
+        exact_tangent(knee.contact, self._need_contact().model.name)
+        slopes = ImplicitEquilibrium(search, instant, knee, points).derivatives()
+        if self.left:
+            # Coordinates are those of the mirror image; the load is in the user's frame.
+            slopes = replace(slopes, by_load=mirrored_spatial(slopes.by_load))
+        return slopes
 
     def show(self, viewer: Any, q: Array, **options: Any) -> None:
         """Draw the knee at q in a user's `pin.visualize.MeshcatVisualizer`.
@@ -426,10 +628,7 @@ class Knee(AssembledKnee):
         data = self.create_data_for_kinematics() if data is None else data
         q = self._check(q, "q", self.model.nq)
         v, a = self._check(v, "v", self.model.nv), self._check(a, "a", self.model.nv)
-        if external is not None and len(external) != self.model.njoints:
-            raise InputError(
-                f"{len(external)} forces", "external", f"give one per joint, {self.model.njoints}"
-            )
+        self._check_external(external)
         muscle_tensions = self._tensions(tensions)
         if self._pulls(muscle_tensions):
             raise InputError(
@@ -459,7 +658,13 @@ class Knee(AssembledKnee):
             muscles,
         )
 
-    def _contact_at(self, data: KneeData, kinematics: KneePose) -> "ProbedContact":
+    def _check_external(self, external: Any) -> None:
+        if external is not None and len(external) != self.model.njoints:
+            raise InputError(
+                f"{len(external)} forces", "external", f"give one per joint, {self.model.njoints}"
+            )
+
+    def contact_at(self, data: KneeData, kinematics: KneePose) -> "ProbedContact":
         """Return the contact at a pose. The last contact is stored in `data`."""
         key = kinematics.pose.tobytes()
         if data.seen is None or data.seen[0] != key:
@@ -467,15 +672,11 @@ class Knee(AssembledKnee):
             data.seen = key, self.contact.at(data.probe, kinematics.pose)
         return data.seen[1]
 
-    def _ligament_stiffness(self, kinematics: KneePose) -> Array:
+    def crossing_stiffness(self, kinematics: KneePose) -> Array:
         """Return the stiffness (6, 6) of the ligaments between femur and tibia."""
         if self._crossing is None:
             return np.zeros((6, 6))
-        from tkamb.knee.contact import DifferenceSettings, batch_differences
-
-        return batch_differences(
-            self._crossing.wrench, kinematics.pose, DifferenceSettings(step=1e-7)
-        )
+        return self._crossing.tangent(kinematics.pose)
 
     def _mirrored_matrix(self, matrix: Array) -> Array:
         if not self.left:

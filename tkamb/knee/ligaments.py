@@ -73,6 +73,22 @@ def quadratic_toe_force(length: ArrayLike, slack_length: ArrayLike, stiffness: A
     return np.where(strain <= 0.0, 0.0, np.where(strain <= 2.0 * LIGAMENT.toe_strain, toe, line))
 
 
+def two_line_slope(length: ArrayLike, slack_length: ArrayLike, stiffness: ArrayLike) -> Array:
+    """Return the derivative (N/m) of `two_line_force` by the length."""
+    slack = np.asarray(slack_length, float)
+    strain = np.asarray(length, float) / slack - 1.0
+    share = np.where(strain <= 2.0 * LIGAMENT.toe_strain, 0.5, 1.0)
+    return np.where(strain <= 0.0, 0.0, share * np.asarray(stiffness))
+
+
+def quadratic_toe_slope(length: ArrayLike, slack_length: ArrayLike, stiffness: ArrayLike) -> Array:
+    """Return the derivative (N/m) of `quadratic_toe_force` by the length."""
+    slack = np.asarray(slack_length, float)
+    strain = np.asarray(length, float) / slack - 1.0
+    share = np.clip(strain / (2.0 * LIGAMENT.toe_strain), 0.0, 1.0)
+    return np.asarray(share * np.asarray(stiffness) / slack)
+
+
 @dataclass(frozen=True, eq=False)
 class Ligament:
     """One bundle on a straight line between a point of one link and a point of another.
@@ -162,6 +178,32 @@ class BundleArrays:
         law = (length, self.slack_length, self.stiffness)
         tension = np.where(self.two_line, two_line_force(*law), quadratic_toe_force(*law))
         return tension, (tension / length)[..., None] * along
+
+    def tangent(self, pose: Array) -> Array:
+        """Return the derivative (6, 6) of `wrench` by a small displacement of the proximal body.
+
+        The pull T u on a distal end changes by (T/L (I - u u^T) + T' u u^T) dx, where dx is the
+        displacement of the proximal end, L the length and T' the slope of the law.
+
+        Args:
+            pose: pose of the proximal frame in the distal frame, shape (4, 4).
+        """
+        proximal = transform(pose, self.proximal)
+        along = proximal - self.distal
+        length = np.linalg.norm(along, axis=-1)
+        tension, _ = self.pulls(proximal, self.distal)
+        law = (length, self.slack_length, self.stiffness)
+        slope = np.where(self.two_line, two_line_slope(*law), quadratic_toe_slope(*law))
+        total, eye = np.zeros((6, 6)), np.eye(3)
+        for p, d, u, t, k, size in zip(
+            proximal, self.distal, along / length[:, None], tension, slope, length, strict=True
+        ):
+            if k or t:
+                change = t / size * (eye - np.outer(u, u)) + k * np.outer(u, u)
+                move = np.hstack([eye, np.cross(p, eye)])
+                by_displacement = change @ move
+                total += np.vstack([by_displacement, np.cross(d, by_displacement.T).T])
+        return total
 
     def wrench(self, poses: Array) -> Array:
         """Return the wrench (..., 6) on the body of the distal ends, about its frame's origin.

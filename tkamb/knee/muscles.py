@@ -267,14 +267,8 @@ class TensionLine:
             data: Pinocchio data with joint placements up to date.
             tension: tension, N.
         """
-        placements = [data.oMi[frame.joint] for frame in self.frames]
-        points = [
-            placement.act(frame.placement.act(position))
-            for placement, frame, position in zip(
-                placements, self.frames, self.positions, strict=True
-            )
-        ]
-        steps = np.diff(np.array(points), axis=0)
+        placements, points = self._points(data)
+        steps = np.diff(points, axis=0)
         directions = steps / np.linalg.norm(steps, axis=1, keepdims=True)
         # The tension pulls the ends along the line. At an inner point the force is the change of
         # direction.
@@ -287,6 +281,60 @@ class TensionLine:
                 placements, self.frames, points, pulls, strict=True
             )
         ]
+
+    def _points(self, data: Any) -> tuple[list[pin.SE3], Array]:
+        """Return the placement of each point's joint, and the points (m, 3), in the world."""
+        placements = [data.oMi[frame.joint] for frame in self.frames]
+        points = [
+            placement.act(frame.placement.act(position))
+            for placement, frame, position in zip(
+                placements, self.frames, self.positions, strict=True
+            )
+        ]
+        return placements, np.array(points)
+
+    def add_derivatives(self, model: Any, data: Any, tension: float, changes: Array) -> None:
+        """Add the derivatives of `forces` by q to `changes` (njoints, 6, nv), tangent space.
+
+        A segment of length l along u changes its direction by (I - u u^T) dx / l. In the joint's
+        axes a force R^T f changes by R^T df - omega x R^T f, and its point does not move.
+
+        Args:
+            model: the user's model.
+            data: Pinocchio data after `pin.computeJointJacobians`.
+            tension: tension, N.
+            changes: derivative of each joint's force in its joint's frame; changed in place.
+        """
+        placements, points = self._points(data)
+        spins, moves = [], []
+        for placement, frame, point in zip(placements, self.frames, points, strict=True):
+            local = np.zeros((6, model.nv))
+            if frame.joint:
+                found = pin.getJointJacobian(model, data, frame.joint, pin.ReferenceFrame.LOCAL)
+                local = found.reshape(6, -1)
+            in_joint = placement.actInv(point)
+            spins.append(local[3:])
+            moves.append(placement.rotation @ (local[:3] + np.cross(local[3:].T, in_joint).T))
+        steps = np.diff(points, axis=0)
+        lengths = np.linalg.norm(steps, axis=1)
+        directions = steps / lengths[:, None]
+        turns = [
+            (np.eye(3) - np.outer(u, u)) @ (after - before) / length
+            for u, length, before, after in zip(
+                directions, lengths, moves[:-1], moves[1:], strict=True
+            )
+        ]
+        zero, none = np.zeros(3), np.zeros((3, model.nv))
+        ahead, behind = [*directions, zero], [zero, *directions]
+        ahead_turn, behind_turn = [*turns, none], [none, *turns]
+        for k, (placement, frame) in enumerate(zip(placements, self.frames, strict=True)):
+            back = placement.rotation.T
+            pull = back @ (tension * (ahead[k] - behind[k]))
+            change = back @ (tension * (ahead_turn[k] - behind_turn[k]))
+            # The axes of the joint turn under the force.
+            change = change - np.cross(spins[k].T, pull).T
+            changes[frame.joint, :3] += change
+            changes[frame.joint, 3:] += np.cross(placement.actInv(points[k]), change.T).T
 
 
 def tension_lines(muscles: Iterable[Muscle], anatomy: Anatomy) -> dict[str, TensionLine]:

@@ -217,6 +217,36 @@ class ReleasedKnee:
         assert knee is not None
         return replace(knee, problem="the iteration between knee and patella does not converge")
 
+    def joint_at(
+        self,
+        instant: Instant,
+        geometry: KneeGeometry,
+        contact: "ProbedContact",
+        points: dict[str, Array],
+        slack: bool,
+    ) -> JointEquilibrium:
+        """Return the equations of the released coordinates at a geometry and its contact.
+
+        Args:
+            instant: the knee at one instant.
+            geometry: result of `Instant.geometry`.
+            contact: the contact at the geometry's coordinates.
+            points: side -> point where an unloaded condyle is nearest to the insert.
+            slack: whether the extensor mechanism carries no load.
+        """
+        middle = _middle(contact, points, geometry.coordinates)
+        return self._joint(instant, geometry, middle, slack)
+
+    def forces(
+        self,
+        instant: Instant,
+        joint: JointEquilibrium,
+        coordinates: Array,
+        contact: "ProbedContact",
+    ) -> "ReleasedForces":
+        """Return the forces on the released coordinates at coordinates (6,) with their contact."""
+        return self._forces(instant, joint, coordinates, contact)
+
     def _residual_limit(self, contact: "ProbedContact") -> float:
         """Return the residual (N) below which a frame has converged."""
         share = max(RELEASED_KNEE.residual_share, contact.accuracy)
@@ -366,7 +396,9 @@ class ReleasedKnee:
             base = forces.tension_in_equilibrium(contact, compliance) - float(
                 compliance @ muscle_wrench
             )
-            share = muscles.share_of_yielding_knee(geometry, base, compliance)
+            touched = {side: condyle.point for side, condyle in contact.condyles.items()}
+            touched = touched if instant.two_condyles else {}
+            share = muscles.share_of_yielding_knee(geometry, base, compliance, touched)
         else:
             points = instant.resultants(coordinates, contact.condyles)
             geometry = replace(geometry, post=instant.post_loads(coordinates, contact.post))

@@ -388,6 +388,10 @@ class FreeForces(Generic[J]):
         """Return the knee coordinates (6,) of a balance."""
         return self._coordinates_at(balance.coordinates)
 
+    def wrench_at(self, coordinates: Array, contact: "ProbedContact") -> Array:
+        """Return the wrench (6,) of a contact on the insert at coordinates (6,), with friction."""
+        return self._with_friction(coordinates, contact)[0]
+
     def _coordinates_at(self, x: Array) -> Array:
         coordinates = self._coordinates.copy()
         coordinates[self._rows] = x / self._scale

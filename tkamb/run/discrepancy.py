@@ -12,10 +12,11 @@ force is therefore d(t) G(t), with the total force F(t) in body weights and
 over the frames t of a trial of an activity.
 
 m is common to all trials of an activity, b to all frames of a trial. w is correlated over about
-0.1 s. S² is the mean square of the trials' biases, V the mean square of their scatters. All trials
-are of one subject. To include the differences between subjects, a published blind prediction of
-other subjects counts as one more trial. Its root mean square error in body weights is divided by
-G of walking. The square, bias² + scatter², is split into S² and V in the ratio of the trials.
+0.1 s. S² is the mean square of the trials' biases, V the mean square of their scatters, over the
+trials of the activity or, if it has none, over all trials. All trials are of one subject. To
+include the differences between subjects, a published blind prediction of other subjects counts as
+one more trial. Its root mean square error in body weights is divided by G of walking. The square,
+bias² + scatter², is split into S² and V in the ratio of the trials.
 
 With n trials of the activity and their mean bias B, m has the mean n B/(n + 1) and the variance
 S²/2/(n + 1). Then d has the variance
@@ -48,11 +49,11 @@ import numpy as np
 from scipy.special import stdtrit
 
 from tkamb.geometry.frames import Array
+from tkamb.run.claims import FORCES, method_error
 
 DATA = Path(__file__).with_suffix(".json")
 QUANTILE_METHOD: Final = "weibull"
 """Quantile method of NumPy: the p quantile of n samples has rank p (n + 1)."""
-FORCES = ("total", "medial", "lateral")
 COLUMNS = {
     "force_si_N": "total",
     "force_total_N": "total",
@@ -69,10 +70,10 @@ COLUMNS = {
 class DiscrepancySettings:
     """How the discrepancy is fitted and added to the samples."""
 
-    quantiles: int = 41
+    quantiles: int = 201
     """1: number of quantiles that represent Student's t. More change the ends of a band by less
     than 1 %."""
-    sample_quantiles: int = 100
+    sample_quantiles: int = 60
     """1: number of quantiles that represent the samples. More change the ends of a band by less
     than 1 %."""
     least_load_BW: float = 0.5
@@ -123,8 +124,6 @@ class TrialError:
         inputs: root mean square over the frames of the standard deviation due to the inputs, as a
             share of G.
         correlation_s: time in which the autocorrelation of the error falls to 1/e, s.
-        nominal_rmse_BW: root mean square error of the nominal run, BW.
-        nominal_bias_BW: mean error of the nominal run, predicted minus measured, BW.
     """
 
     trial: str
@@ -137,8 +136,6 @@ class TrialError:
     independent_frames: float
     inputs: float
     correlation_s: float
-    nominal_rmse_BW: float
-    nominal_bias_BW: float
 
 
 @dataclass(frozen=True)
@@ -181,7 +178,6 @@ def trial_error(
     measured: Array,
     nominal: Array,
     load: Array,
-    body_weight: float,
 ) -> TrialError | None:
     """Return the error of a predicted force in a trial; None: too few frames.
 
@@ -192,7 +188,6 @@ def trial_error(
         measured: measured force, N, (f,); NaN in frames without a measurement.
         nominal: force of the nominal run, N, (f,).
         load: load G from `load_of`, N, (f,).
-        body_weight: body weight, N.
     """
     enough = np.isfinite(samples).sum(axis=0) > samples.shape[0] / 2
     compared = enough & np.isfinite(measured) & np.isfinite(nominal)
@@ -201,7 +196,6 @@ def trial_error(
     shares = samples[:, compared] / load[compared]
     error = measured[compared] / load[compared] - np.nanmedian(shares, axis=0)
     rho = _frame_correlation(error - error.mean())
-    nominal_error = (nominal - measured)[compared] / body_weight
     return TrialError(
         *names,
         frames=int(compared.sum()),
@@ -210,8 +204,6 @@ def trial_error(
         independent_frames=float(compared.sum()) * (1.0 - rho**2) / (1.0 + rho**2),
         inputs=float(np.sqrt(np.nanvar(shares, axis=0).mean())),
         correlation_s=-float(np.median(np.diff(time[compared]))) / float(np.log(rho)),
-        nominal_rmse_BW=float(np.sqrt((nominal_error**2).mean())),
-        nominal_bias_BW=float(nominal_error.mean()),
     )
 
 
@@ -233,7 +225,9 @@ def fitted(errors: Sequence[TrialError], force: str, activity: str | None) -> Di
     chosen = [one for one in errors if one.force == force]
     if not chosen:
         return None
-    activity_biases = [one.bias for one in chosen if one.activity == activity]
+    own = [one for one in chosen if one.activity == activity]
+    activity_biases = [one.bias for one in own]
+    every, chosen = len(chosen), own or chosen
     biases = np.array([one.bias**2 for one in chosen])
     scatters = np.array([one.scatter**2 for one in chosen])
     share = float(biases.sum() / max((biases + scatters).sum(), np.finfo(float).tiny))
@@ -252,7 +246,7 @@ def fitted(errors: Sequence[TrialError], force: str, activity: str | None) -> Di
         deviation=float(np.sqrt(max(0.0, total / (len(chosen) + 1) - inputs))),
         freedom=total**2 / max(uncertain, np.finfo(float).tiny),
         own_trials=len(activity_biases),
-        trials=len(chosen),
+        trials=every,
     )
 
 
@@ -262,7 +256,8 @@ def band_with_discrepancy(
     """Return the band of inputs and discrepancy together, (percents, f), in the samples' unit.
 
     The band belongs to the sum of two independent variables: the force of the samples, and the
-    discrepancy. A negative sum counts as zero.
+    discrepancy. Contacts only push, so the band is that of the sums above zero. It is asymmetric
+    where the force is small.
 
     Args:
         samples: force of each sample, (n, f); NaN in failed frames.
@@ -282,10 +277,14 @@ def band_with_discrepancy(
         axis=0,
         method=QUANTILE_METHOD,
     )
-    every = np.maximum(of_samples[:, None, :] + added[:, None] * load[finite], 0.0)
-    ends[:, finite] = np.percentile(
-        every.reshape(len(of_samples) * len(added), -1), list(percents), axis=0
-    )
+    every = of_samples[:, None, :] + added[:, None] * load[finite]
+    every = np.sort(every.reshape(len(of_samples) * len(added), -1), axis=0)
+    # The sums below zero come first. The quantiles are those of the remaining ones.
+    below = (every < 0.0).sum(axis=0)
+    for end, percent in zip(ends, percents, strict=True):
+        rank = below + (len(every) - 1 - below) * percent / 100.0
+        place = np.clip(np.round(rank).astype(int), 0, len(every) - 1)
+        end[finite] = np.maximum(every[place, np.arange(every.shape[1])], 0.0)
     return ends
 
 
@@ -329,48 +328,12 @@ def discrepancy_of(summary: Mapping[str, Any]) -> dict[str, Discrepancy]:
 
 
 def discrepancy_summary(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the summary's key `discrepancy`: numbers for each force, and a sentence."""
-    discrepancy = discrepancy_of(summary)
+    """Return the summary's key `discrepancy`: the bands' discrepancy, and the measured error."""
+    error = method_error(summary)
     return {
-        "forces": {force: asdict(one) for force, one in discrepancy.items()},
-        "trials": [one.trial for one in known_errors() if one.force == FORCES[0]],
-        "rmse_BW": rms_error(known_errors(), FORCES[0], summary.get("activity")),
-        "subjects": len({one.subject for one in known_errors()}),
-        "words": discrepancy_words(summary),
+        "forces": {force: asdict(one) for force, one in discrepancy_of(summary).items()},
+        "trials": [one.trial for one in error.trials],
+        "rmse_BW": error.rmse(FORCES[0]),
+        "subjects": len(error.subjects),
+        "words": " ".join(error.sentences),
     }
-
-
-def _of_activity(errors: Sequence[TrialError], activity: str | None) -> Sequence[TrialError]:
-    """Return the trials of an activity; all trials if the activity has none."""
-    return [one for one in errors if one.activity == activity] or errors
-
-
-def rms_error(errors: Sequence[TrialError], force: str, activity: str | None) -> float:
-    """Return the root mean square error of the nominal runs over the trials, BW."""
-    rms = [one.nominal_rmse_BW for one in _of_activity(errors, activity) if one.force == force]
-    return float(np.sqrt(np.mean(np.square(rms))))
-
-
-def discrepancy_words(summary: Mapping[str, Any]) -> str:
-    """Return sentences on the errors of the method against measured knees."""
-    errors, activity = known_errors(), summary.get("activity")
-    compared = _of_activity(errors, activity)
-    of_what = (
-        f"in {activity}" if any(one.activity == activity for one in errors) else "in all activities"
-    )
-    parts = []
-    for force in FORCES:
-        if any(one.force == force for one in compared):
-            parts.append(f"{rms_error(errors, force, activity):.2f} BW ({force})")
-    trials = len({one.trial for one in compared})
-    subjects = len({one.subject for one in compared})
-    words = (
-        f"Against measured knees the RMS error of this method was {', '.join(parts)} {of_what}: "
-        f"{trials} trial{'s' * (trials != 1)}, {subjects} subject{'s' * (subjects != 1)}."
-    )
-    if "muscles" in (summary.get("scene_tables") or {}):
-        return words
-    reason = (
-        "The compared runs had all muscles. This run, without [muscles], may have a larger error."
-    )
-    return f"{words} {reason}"

@@ -204,7 +204,8 @@ def frame_press(folder: Path, frame: int, resolution_mm: float | None = None) ->
     row, maps = map_rows(results).get(frame), results.maps
     if maps is None or row is None:
         raise InputError(f"frame {frame} has no pressure map", folder, "choose another frame")
-    load = -float(maps.nodal_force_N[row, :, 1].sum())
+    data = maps.frame_data(row)
+    load = -float(data["nodal_force_N"][:, 1].sum())
     if not load > 0:
         raise InputError(f"frame {frame} carries no load", folder, "choose another frame")
     pair, spacing = _pair(results)
@@ -212,7 +213,7 @@ def frame_press(folder: Path, frame: int, resolution_mm: float | None = None) ->
     problem = press_problem(pair, load, pose, resolution_mm or spacing)
     model = contact_class(contact["model"])
     origin = f"Frame {frame} of {folder} by {contact['model']} at {spacing:g} mm"
-    peak = float(maps.pressure_Pa[row].max())
+    peak = float(data["pressure_Pa"].max())
     lateral, notes = lateral_axis_name(results), tuple(_notes(results, frame, pair, model))
     return FramePress(problem, pair.approach(pose), peak, origin, lateral, notes)
 

@@ -11,8 +11,10 @@ import json
 import logging
 import os
 import re
+import signal
 import sys
 import tempfile
+import threading
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
@@ -55,7 +57,7 @@ def guarded(command: Callable[[], int], options: argparse.Namespace) -> int:
             if not sys.warnoptions:
                 warnings.simplefilter("ignore")  # Python warnings address developers
             try:
-                with interrupt_as_such():
+                with interrupt_as_such(), terminated_as_interrupted():
                     return command()
             finally:  # also after an exit by argparse, so that a failed write is reported
                 sys.stdout.flush()
@@ -107,6 +109,21 @@ def interrupt_as_such() -> Iterator[None]:
         if isinstance(cause, KeyboardInterrupt):
             raise KeyboardInterrupt from None
         raise
+
+
+@contextmanager
+def terminated_as_interrupted() -> Iterator[None]:
+    """Raise KeyboardInterrupt for SIGTERM, so that finished frames are published and temporary
+    folders removed.
+    """
+    if threading.current_thread() is not threading.main_thread():  # only it receives signals
+        yield
+        return
+    handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, handler)
 
 
 class StreamError(TkambError):

@@ -75,9 +75,53 @@ def _code_in(folder: Path) -> Iterable[Path]:
     return (path for path in folder.rglob("*") if path.suffix in SUFFIXES and path.is_file())
 
 
-def scene_hash(case: "Case") -> str:
-    """Return the SHA-256 of the validated scene."""
-    return hashlib.sha256(case.scene.identity_json.encode()).hexdigest()
+def scene_hash(scene: "Scene") -> str:
+    """Return the SHA-256 of a validated scene and of the content of all files that it names.
+
+    The names and places of the files do not count: a copy of scene and files has the same hash.
+    """
+    return hashlib.sha256(json.dumps(scene_content(scene)).encode()).hexdigest()
+
+
+def scene_content(scene: "Scene") -> Any:
+    """Return the scene as JSON types, with the SHA-256 of the content in place of each path."""
+    unused: dict[str, Any] = {"base": True, "output": {"directory"}, "wear": True}
+    unused |= {} if scene.material else {"material": True}
+    return _with_content(scene.model_dump(exclude=unused))
+
+
+def _with_content(value: Any) -> Any:
+    if isinstance(value, Path):
+        files = [value, *(named_files(value) if value.suffix.lower() == ".osim" else ())]
+        return [sha256_of(path) for path in files] if value.is_file() else value.name
+    if isinstance(value, dict):
+        return {str(key): _with_content(item) for key, item in value.items()}
+    return [_with_content(one) for one in value] if isinstance(value, list | tuple) else value
+
+
+def settings_hash(scene: "Scene") -> str:
+    """Return the SHA-256 of a validated scene without the files that it names."""
+    content = json.dumps(relative_paths(scene.model_dump(exclude={"wear", "base"}), None))
+    return hashlib.sha256(content.encode()).hexdigest()
+
+
+def relative_paths(value: Any, folder: Path | None) -> Any:
+    """Return nested tables as JSON types, with paths relative to a folder; None: their names."""
+    if isinstance(value, Path):
+        return value.name if folder is None else relative_name(value, folder)
+    if isinstance(value, dict):
+        return {str(key): relative_paths(item, folder) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [relative_paths(item, folder) for item in value]
+    return value
+
+
+def relative_name(path: Path, folder: Path) -> str:
+    """Return a path relative to a folder with "/"; the absolute path on another drive."""
+    try:
+        return Path(os.path.relpath(path, folder)).as_posix()
+    except ValueError:  # Windows: another drive
+        return path.as_posix()
 
 
 def run_identity(case: "Case", frames: range) -> dict[str, Any]:
@@ -86,7 +130,7 @@ def run_identity(case: "Case", frames: range) -> dict[str, Any]:
     The identity of a run with a plug-in's contact model includes the hash of the plug-in.
     """
     identity = {
-        "scene": scene_hash(case),
+        "scene": settings_hash(case.scene),
         "content of a file": files_hash(case),
         "choice of frames": [frames.start, frames.stop, frames.step],
         "version of tkamb": __version__,
@@ -106,11 +150,17 @@ def files_hash(case: "Case") -> str:
 
 
 def input_hashes(case: "Case", scene: Path | None) -> dict[str, str]:
-    """Return path -> SHA-256 of the scene file, its base and all files that the run reads."""
+    """Return name -> SHA-256 of the scene file, its base and all files that the run reads.
+
+    Names are relative to the folder of the scene file. Without a scene file they are absolute.
+    """
     from tkamb.io.scene.scene import scene_files
 
-    paths = [*([] if scene is None else scene_files(scene.absolute())), *_files_read(case)]
-    return {str(path): sha256_of(path) for path in paths}
+    if scene is None:
+        return {str(path): sha256_of(path) for path in _files_read(case)}
+    folder = scene.absolute().parent
+    paths = [*scene_files(scene.absolute()), *(path.absolute() for path in _files_read(case))]
+    return {relative_name(path, folder): sha256_of(path) for path in paths}
 
 
 def _files_read(case: "Case") -> list[Path]:
@@ -142,12 +192,13 @@ def case_of_results(results: "Results") -> "Case":
 
     summary = results.summary
     case, scene = load_case(_scene_of(summary)), summary.get("scene")
-    if scene_hash(case) != summary.get("scene_sha256"):
+    same = scene_hash(case.scene) == summary.get("scene_sha256")
+    if not same and same_files(case, summary):
         has_overrides = "overrides" in summary
         what = "has changed since these results were computed"
         what += "" if has_overrides else ", or was run with --set"
         raise InputError(what, scene, run_again(summary))
-    if not same_files(case, summary):
+    if not same:
         what = "a mesh or table of the scene has changed since these results were computed"
         raise InputError(what, scene, run_again(summary))
     return case

@@ -94,6 +94,13 @@ def known_error(
     return known_errors().get((label, float(resolution_mm), material))
 
 
+def outside_measured(flags: Iterable[str]) -> bool:
+    """Return whether a contact's flags name a defect or a support that no measured case has."""
+    from tkamb.contact.flags import MESH_DEFECT, UNSUPPORTED  # only where contact is modelled
+
+    return any(words in flag for flag in flags for words in (MESH_DEFECT, UNSUPPORTED))
+
+
 def left_out(model: str, bearing: str) -> tuple[str, ...]:
     """Return sentences on features of a bearing ("fixed", "mobile") that a contact model lacks."""
     from tkamb.contact.registry import contact_class  # only where contact is modelled

@@ -2,10 +2,12 @@
 
 The file is written a few frames at a time: first their maps, then their times. The length of
 `/time_s` is therefore the number of complete frames, even if the run was killed. Each frame is a
-compressed chunk of its own, so that a write does not alter earlier frames.
+compressed chunk of its own, so that a write does not alter earlier frames. Readers inside tkamb
+take a few frames at a time (`ContactMaps.rows`, `ContactMaps.blocks`), so that their memory does
+not depend on the length of the recording.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,8 +20,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tkamb.errors import InputError, not_installed
-from tkamb.files import check_file, replaced_file
+from tkamb.files import check_file, replaced_file, undamaged
 from tkamb.geometry.frames import Array
+from tkamb.geometry.memory import available_memory
 from tkamb.io.hdf5_file import NotingFile, check_written
 from tkamb.run.maps_check import check_maps_file, check_values
 
@@ -32,6 +35,11 @@ PER_FRAME = (
     *("pressure_Pa", "gap_m", "nodal_force_N", "femoral_pose"),
     *("contact_points_m", "contact_normals", "time_s"),
 )
+
+BLOCK_BYTES = 16e6
+"""bytes: size of the maps that are read at a time. Smaller blocks cost more calls of HDF5."""
+SHARE_OF_MEMORY = 0.25
+"""1: largest size of a whole array as a share of the available memory. Not studied."""
 
 
 @dataclass(frozen=True)
@@ -332,7 +340,40 @@ class ContactMaps:
 
     def frame_data(self, k: int) -> dict[str, Array]:
         """Return pressure_Pa (n,), gap_m (n,) and nodal_force_N (n, 3) of frame k by name."""
-        return {name: getattr(self, name)[k] for name in ("pressure_Pa", "gap_m", "nodal_force_N")}
+        names = ("pressure_Pa", "gap_m", "nodal_force_N")
+        return {name: self.rows(name, [range(len(self))[k]])[0] for name in names}
+
+    def rows(self, name: str, frames: Sequence[int] | slice) -> Array:
+        """Return an array of some frames, (len(frames), ...).
+
+        Args:
+            name: name of the array, such as "pressure_Pa".
+            frames: numbers of the frames, or a slice of them.
+        """
+        if not isinstance(self.source, Path):
+            return np.asarray(self.source[name], float)[frames]
+        with _opened(self.source) as file:
+            if isinstance(frames, slice):
+                return np.asarray(file[name][frames], float)
+            return np.array([file[name][k] for k in frames], float)
+
+    def blocks(self, name: str) -> Iterator[Array]:
+        """Yield an array in blocks of successive frames."""
+        step = max(1, int(BLOCK_BYTES // (24 * max(len(self.points_m), 1))))
+        for begin in range(0, len(self), step):
+            yield self.rows(name, slice(begin, min(begin + step, len(self))))
+
+    @cached_property
+    def peaks_Pa(self) -> Array:
+        """(f,) largest pressure of each frame; NaN in failed frames."""
+        peaks = [block.max(axis=1, initial=0.0) for block in self.blocks("pressure_Pa")]
+        return np.concatenate([np.zeros(0), *peaks])
+
+    @cached_property
+    def forces_N(self) -> Array:
+        """(f, 3) sum of the forces on the insert; NaN in failed frames."""
+        forces = [block.sum(axis=1) for block in self.blocks("nodal_force_N")]
+        return np.concatenate([np.zeros((0, 3)), *forces])
 
     def _optional_array(self, name: str) -> Array:
         """Return an array (f, 3, 3), or NaN if an early file lacks it."""
@@ -346,10 +387,10 @@ class ContactMaps:
         if not isinstance(self.source, Path):
             return np.asarray(self.source[name])
         with _opened(self.source) as file:
-            if name not in file:
-                raise InputError(
-                    f"has no '{name}'", self.source, "give a contact.h5 that tkamb wrote"
-                )
+            size, most = 8.0 * file[name].size, SHARE_OF_MEMORY * available_memory()
+            if size > most:
+                what = f"'{name}' has {size / 1e9:.3g} GB; the limit is {most / 1e9:.3g} GB"
+                raise InputError(what, self.source, "free memory, or read some frames by `rows`")
             return np.asarray(file[name][:frames], None if name == "triangles" else float)
 
 
@@ -362,7 +403,7 @@ def read_maps(path: str | Path) -> ContactMaps:
     maps = ContactMaps(Path(path))
     check_file(path, float("inf"), what="contact.h5")
     with _opened(maps.source) as file:  # type: ignore[arg-type]
-        check_values(file, path)
+        check_values(file)
     len(maps)
     return maps
 
@@ -379,7 +420,8 @@ def write_maps(maps: ContactMaps, path: Path) -> None:
         MapWriter(temporary, points, triangles, attributes) as writer,
     ):
         for k, time in enumerate(maps.time_s):
-            frame = (maps.pressure_Pa[k], maps.gap_m[k], maps.nodal_force_N[k])
+            data = maps.frame_data(k)
+            frame = (data["pressure_Pa"], data["gap_m"], data["nodal_force_N"])
             places = (maps.contact_points_m[k], maps.contact_normals[k])
             writer.append(time, *frame, maps.femoral_pose[k], *places)
 
@@ -392,16 +434,11 @@ def _is_plain(value: Any) -> bool:
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
     """Open a contact.h5 of tkamb; raise an InputError for any other or damaged file."""
-    try:
-        with h5py.File(path, "r") as file:
-            check_maps_file(file, path)
+    with undamaged(path):
+        try:
+            file = h5py.File(path, "r")
+        except FileNotFoundError:
+            raise InputError("no such file", path) from None
+        with file:
+            check_maps_file(file)
             yield file
-    except InputError:
-        raise
-    except FileNotFoundError:
-        raise InputError("no such file", path) from None
-    except MemoryError:
-        raise InputError("needs more memory than there is", path, "run it again") from None
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
-        reason = (str(error).strip("'\"").splitlines() or [type(error).__name__])[0]
-        raise InputError(f"cannot be read as HDF5 ({reason})", path) from None

@@ -5,24 +5,20 @@ datasets). A results folder from someone else could thereby make tkamb read priv
 references are refused.
 """
 
-from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 
-from tkamb.errors import InputError
-from tkamb.geometry.memory import available_memory
-
-WRITTEN = "run it again, or ask whoever sent it for a folder that `tkamb run` wrote"
 FILTERS = frozenset({h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE})
 """Compression filters that tkamb uses. Any other filter could load a library."""
-SHARE_OF_MEMORY = 0.25
-"""1: largest size of an array as a share of the available memory. A report reads about three."""
 FARTHEST = 10.0
 """m: largest distance of a point from the insert's origin."""
 
 SHAPES = {
+    "points_m": ("points", 3),
+    "triangles": (None, 3),
+    "time_s": ("frames",),
     "pressure_Pa": ("frames", "points"),
     "gap_m": ("frames", "points"),
     "nodal_force_N": ("frames", "points", 3),
@@ -30,91 +26,66 @@ SHAPES = {
     "contact_points_m": ("frames", 3, 3),
     "contact_normals": ("frames", 3, 3),
 }
-"""Name of an array with one row per frame -> its shape."""
+"""Name of an array -> its shape. A killed run has more rows than times: its last frames."""
 SINCE_LATER = ("contact_points_m", "contact_normals")
 """Arrays that files of early releases lack."""
 
 
-def check_maps_file(file: Any, path: str | Path) -> None:
+def check_maps_file(file: Any) -> None:
     """Raise unless an open HDF5 file itself contains the arrays that tkamb writes.
 
-    Args:
-        file: open `h5py.File`.
-        path: path of the file, for the message.
-
     Raises:
-        InputError: an array is missing, too large, stored in another file, or has another shape or
-            type.
+        ValueError: an array is missing, stored in another file, or has another shape or type.
     """
-    for name in file:
-        _check_link(file, name, path)
-    points = _dataset(file, "points_m", path)
-    triangles = _dataset(file, "triangles", path)
-    times = _dataset(file, "time_s", path)
-    _check(len(points.shape) == 2 and points.shape[1] == 3, "points_m", points, path)
-    _check(len(triangles.shape) == 2 and triangles.shape[1] == 3, "triangles", triangles, path)
-    _check(triangles.dtype.kind in "iu", "triangles", triangles, path)
-    _check(len(times.shape) == 1, "time_s", times, path)
-    frames = times.shape[0]
-    for name, sizes in SHAPES.items():
-        if name in SINCE_LATER and name not in file:
-            continue
-        dataset = _dataset(file, name, path)
-        shape = tuple(points.shape[0] if size == "points" else size for size in sizes[1:])
-        # a killed run has more rows than times: the last frames were not completed
-        is_complete = len(dataset.shape) == len(sizes) and dataset.shape[0] >= frames
-        _check(is_complete and dataset.shape[1:] == shape, name, dataset, path)
+    arrays = {name: _array(file, name) for name in SHAPES if name in file or not _is_later(name)}
+    sizes = {"points": arrays["points_m"].shape[:1], "frames": arrays["time_s"].shape[:1]}
+    for name, dataset in arrays.items():
+        shape, expected = dataset.shape, SHAPES[name]
+        fits = len(shape) == len(expected) and all(
+            size in (None, n, "frames") or (n,) == sizes.get(str(size))
+            for n, size in zip(shape, expected, strict=True)
+        )
+        if not fits or (expected[0] == "frames" and shape[:1] < sizes["frames"]):
+            raise ValueError(f"'{name}' has the shape {shape}")
+    if arrays["triangles"].dtype.kind not in "iu":
+        raise ValueError("'triangles' are not numbers of points")
 
 
-def check_values(file: Any, path: str | Path) -> None:
+def check_values(file: Any) -> None:
     """Raise unless points are near the insert, triangles have valid indices, and times increase.
 
     Args:
         file: open `h5py.File` after `check_maps_file`.
-        path: path of the file, for the message.
 
     Raises:
-        InputError: a value is out of range.
+        ValueError: a value is out of range.
     """
     points, triangles, times = (file[name][()] for name in ("points_m", "triangles", "time_s"))
     if not (np.abs(points) <= FARTHEST).all():
-        raise InputError(f"'points_m' holds points beyond {FARTHEST:g} m", path, WRITTEN)
+        raise ValueError(f"'points_m' holds points beyond {FARTHEST:g} m")
     if triangles.size and not 0 <= triangles.min() <= triangles.max() < len(points):
-        raise InputError("'triangles' refers to points that do not exist", path, WRITTEN)
+        raise ValueError("'triangles' refers to points that do not exist")
     if not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
-        raise InputError("'time_s' does not increase from frame to frame", path, WRITTEN)
+        raise ValueError("'time_s' does not increase from frame to frame")
 
 
-def _check_link(file: Any, name: str, path: str | Path) -> None:
-    """Raise unless a name refers to an array or a group in the file itself."""
+def _is_later(name: str) -> bool:
+    return name in SINCE_LATER
+
+
+def _array(file: Any, name: str) -> Any:
+    """Return an array of numbers in the file itself."""
+    if name not in file and file.get(name, getlink=True) is None:
+        raise ValueError(f"has no '{name}'")
     if not isinstance(file.get(name, getlink=True), h5py.HardLink):
-        raise InputError(f"'{name}' is a link, which tkamb does not follow", path, WRITTEN)
-
-
-def _dataset(file: Any, name: str, path: str | Path) -> Any:
-    """Return an array of numbers in the file itself; raise an InputError for anything else."""
-    if name not in file:
-        raise InputError(f"has no '{name}'", path, "give a contact.h5 that tkamb wrote")
+        raise ValueError(f"'{name}' is a link, which tkamb does not follow")
     dataset = file[name]
-    if not isinstance(dataset, h5py.Dataset):
-        raise InputError(f"'{name}' is not an array", path, WRITTEN)
+    if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind not in "fiu":
+        raise ValueError(f"'{name}' is no array of numbers")
     properties = dataset.id.get_create_plist()
     if dataset.is_virtual or properties.get_external_count():
-        raise InputError(f"'{name}' is stored in another file, which is not read", path, WRITTEN)
+        raise ValueError(f"'{name}' is stored in another file, which is not read")
     filters = {properties.get_filter(k)[0] for k in range(properties.get_nfilters())}
     if not filters <= FILTERS:
-        raise InputError(f"'{name}' has a compression that tkamb does not use", path, WRITTEN)
-    if dataset.dtype.kind not in "fiu" or dataset.shape is None:
-        raise InputError(f"'{name}' does not hold numbers", path, WRITTEN)
-    size, most = 8.0 * dataset.size, SHARE_OF_MEMORY * available_memory()
-    if size > most:
-        what = f"'{name}' has {size / 1e9:.3g} GB; the limit is {most / 1e9:.3g} GB"
-        raise InputError(what, path, "free memory, or run fewer frames")
+        raise ValueError(f"'{name}' has a compression that tkamb does not use")
     return dataset
-
-
-def _check(valid: bool, name: str, dataset: Any, path: str | Path) -> None:
-    if not valid:
-        shape = " x ".join(map(str, dataset.shape))
-        what = f"'{name}' has a wrong type or shape: {dataset.dtype}, {shape}"
-        raise InputError(what, path, WRITTEN)

@@ -183,7 +183,7 @@ def map_rows(results: "Results") -> dict[int, int]:
     """Return frame -> index of its map, for every frame with a map."""
     if results.maps is None:
         return {}
-    finite = np.atleast_1d(np.isfinite(results.maps.pressure_Pa).all(axis=1))
+    finite = np.isfinite(results.maps.peaks_Pa)
     row_at = {float(t): row for row, t in enumerate(results.maps.time_s) if finite[row]}
     times = [float(time) for time in results["time_s"]]
     return {frame: row_at[time] for frame, time in enumerate(times) if time in row_at}

@@ -1,6 +1,7 @@
 """A press of two meshes at a given pose with a given load (`tkamb press`)."""
 
 import math
+import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,9 +34,16 @@ from tkamb.io.given_material import (
     material_in_words,
     named_material,
 )
-from tkamb.io.recordings.meshes import axes_rotation, load_surface, mirrored
+from tkamb.io.recordings.meshes import axes_rotation, check_same_space, load_surface, mirrored
 from tkamb.knee.adjustment import press_adjusted
-from tkamb.run.known_errors import KnownError, as_json, known_error, known_error_words, left_out
+from tkamb.run.known_errors import (
+    KnownError,
+    as_json,
+    known_error,
+    known_error_words,
+    left_out,
+    outside_measured,
+)
 from tkamb.units import DEGREE, LENGTH, MEGAPASCAL, MILLIMETRE
 
 
@@ -340,7 +348,9 @@ def press_meshes(
         prepare_seconds=prepared - started,
         solve_seconds=solved - prepared,
         peak_rss_MB=peak_rss(),
-        known_error=known_error(contact, resolution_mm, pair.material.name, options),
+        known_error=None
+        if outside_measured(result.flags)
+        else known_error(contact, resolution_mm, pair.material.name, options),
     )
 
 
@@ -401,6 +411,8 @@ def load_pair(
     """Return femoral component, insert and pose_femoral_in_insert (4, 4); see `press_meshes`."""
     rotation = axes_rotation(axes)
     femoral_pose = mesh_pose(pose, units, rotation)
+    if os.path.isfile(femoral) and os.path.isfile(insert):  # `load_surface` names a missing file
+        check_same_space(femoral, insert)
     femoral_surface = load_surface(femoral, units, axes, name="femoral")
     insert_surface = load_surface(insert, units, axes, name="insert", closed=True)
     if side == "left":

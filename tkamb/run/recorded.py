@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from tkamb.geometry.frames import Array
 from tkamb.io.scene.case import Case
+from tkamb.run.claims import split_of
 from tkamb.run.columns import ACTIVATION, ENVELOPE, family_column
 from tkamb.run.status import FAILED
 
@@ -16,12 +17,6 @@ if TYPE_CHECKING:
     from tkamb.io.recordings.measured import Envelopes
 
 
-PREDICTED = {
-    "total": ("force_si_N",),
-    "medial": ("medial_force_N", "medial_force_equilibrium_N"),
-    "lateral": ("lateral_force_N", "lateral_force_equilibrium_N"),
-}
-"""Measured force -> columns that predict it. The first column with a number is used."""
 LAGS = np.arange(-40, 41) * 0.005
 """s: lags of the cross-correlation."""
 
@@ -76,15 +71,6 @@ def measured_column(name: str) -> str:
     return f"measured_{name}_N"
 
 
-def predicted_columns(columns: Mapping[str, Any]) -> dict[str, str]:
-    """Return force -> the first of its columns with a number."""
-    labels = {}
-    for name, candidates in PREDICTED.items():
-        present = [one for one in candidates if one in columns and np.isfinite(columns[one]).any()]
-        labels[name] = next(iter(present or candidates))
-    return labels
-
-
 def compare_measured(
     columns: Mapping[str, Any], names: Iterable[str], body_weight: float
 ) -> dict[str, dict[str, Any]]:
@@ -104,9 +90,9 @@ def compare_measured(
     """
     failed = np.array([status.startswith(FAILED) for status in columns["status"]], bool)
     missing = np.full(len(failed), np.nan)
-    result, predicting = {}, predicted_columns(columns)
+    result, split = {}, split_of(columns)
     for name in names:
-        column, measured = predicting[name], columns[measured_column(name)]
+        column, measured = split.column(name), columns[measured_column(name)]
         predicted = columns.get(column, missing)
         counted = _frame_counts(predicted, measured, failed)
         error = _force_errors(columns["time_s"], predicted, measured, body_weight)

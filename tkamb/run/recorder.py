@@ -7,8 +7,7 @@ computed". A resumed run reads the files of the frames. They are removed when al
 written. Before the first frame is finished, nothing in the output folder changes.
 
 `.frames` also has a file with the identity of the run. Each frame has a SHA-256 over identity,
-frame number and content. A frame with another SHA-256 counts as absent. A frame with the right
-SHA-256 and impossible content was forged, and is refused.
+frame number and content. A frame with another SHA-256 counts as absent.
 """
 
 import hashlib
@@ -19,19 +18,25 @@ import shutil
 import signal
 import threading
 import time as clock
-import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-from zipfile import BadZipFile, ZipFile
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from tkamb.errors import InputError
-from tkamb.files import read_bytes, read_json, replaced_file, replaced_together, write_text
+from tkamb.files import (
+    read_bytes,
+    read_json,
+    replaced_file,
+    replaced_together,
+    undamaged,
+    write_text,
+)
 from tkamb.geometry.frames import Array
+from tkamb.io.claim import settle
 from tkamb.run.results_folder import (
     FOLDER,
     IDENTITY_NAME,
@@ -42,6 +47,7 @@ from tkamb.run.results_folder import (
     read_results,
     remove_shards,
 )
+from tkamb.run.tabulate import RowTable
 
 if TYPE_CHECKING:
     from tkamb.run.maps import ContactMaps, MapWriter
@@ -51,17 +57,13 @@ if TYPE_CHECKING:
 LARGEST = 2e9
 """bytes: largest size of a frame. A map of 100,000 points has 5 MB."""
 
-UNREADABLE = (
-    *(ValueError, TypeError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError),
-    *(MemoryError, BadZipFile, zlib.error),
-)
-"""Exceptions of numpy, zipfile and json for damaged files."""
-
 CONTACT_PLACES = ("contact_points", "contact_normals")
 """Arrays (3, 3) of contact points, m, and unit normals of medial condyle, lateral condyle and
 patella; NaN without contact."""
 
 Row = dict[str, Any]
+T = TypeVar("T")
+FORGET_FRAME = "remove it, or leave out resume=True to begin again"
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,35 +79,8 @@ class Shard:
     contact: dict[str, Array] | None
 
 
-ANY = -1
-"""Placeholder for any length in a shape."""
-
-
-def have(arrays: Mapping[str, Array], expected: Mapping[str, tuple[str, tuple[int, ...]]]) -> bool:
-    """Return whether arrays have exactly the expected names, kinds and shapes.
-
-    Args:
-        arrays: name -> array.
-        expected: name -> allowed letters of `numpy.dtype.kind`, and the shape, with `ANY` for any
-            length.
-    """
-    return arrays.keys() == expected.keys() and all(
-        arrays[name].dtype.kind in kinds
-        and arrays[name].ndim == len(shape)
-        and all(length in (ANY, n) for n, length in zip(arrays[name].shape, shape, strict=True))
-        for name, (kinds, shape) in expected.items()
-    )
-
-
 def read_arrays(content: bytes) -> dict[str, Array]:
-    """Return the arrays of a .npz file without unpickling.
-
-    Raises:
-        UNREADABLE: the bytes are damaged, or the arrays are larger than `LARGEST`.
-    """
-    with ZipFile(io.BytesIO(content)) as packed:
-        if sum(part.file_size for part in packed.infolist()) > LARGEST:
-            raise ValueError("the unpacked arrays are too large")
+    """Return the arrays of a .npz file without unpickling."""
     with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
         return dict(arrays)
 
@@ -165,17 +140,11 @@ class Shards:
         with replaced_file(self._path(frame)) as temporary:
             temporary.write_bytes(self._digest(frame, content) + content)
 
-    def get(
-        self, frame: int, is_whole: Callable[[Shard], bool] = lambda shard: True
-    ) -> Shard | None:
+    def get(self, frame: int) -> Shard | None:
         """Return a frame; None: it is absent, incomplete or of another run.
 
-        Args:
-            frame: number of the frame.
-            is_whole: function that returns whether a frame has the content of this run's frames.
-
         Raises:
-            InputError: the frame is forged: it has the right SHA-256, but impossible content.
+            InputError: the frame has the right SHA-256, but cannot be read.
         """
         path = self._path(frame)
         try:
@@ -185,17 +154,19 @@ class Shards:
         digest, content = packed[:32], packed[32:]
         if self._digest(frame, content) != digest:
             return None
-        try:  # a forged frame has a valid digest, so that its content is checked too
+        with undamaged(path, FORGET_FRAME):
             arrays = read_arrays(content)
-            row = dict(json.loads(arrays.pop("row").tobytes()))
-            shard = Shard(row, arrays or None)
-            is_valid = is_whole(shard)
-        except UNREADABLE:
-            is_valid = False
-        if not is_valid:
-            what = "has content that no frame of this run has: somebody changed it"
-            raise InputError(what, path, "remove it, or leave out resume=True to begin again")
-        return shard
+            return Shard(dict(json.loads(arrays.pop("row").tobytes())), arrays or None)
+
+    def read(self, frame: int, make: Callable[[Shard], T]) -> T | None:
+        """Return what `make` returns for a frame; None: as `get`.
+
+        Raises:
+            InputError: the frame has the right SHA-256, but `make` cannot use it.
+        """
+        shard = self.get(frame)
+        with undamaged(self._path(frame), FORGET_FRAME):
+            return None if shard is None else make(shard)
 
     def _digest(self, frame: int, content: bytes) -> bytes:
         digest = hashlib.sha256(f"{frame}\n{self._identity}\n".encode())
@@ -209,11 +180,8 @@ class Shards:
         path = self.folder / IDENTITY_NAME
         if not path.exists():
             return None
-        try:
+        with undamaged(path, "leave out resume=True to begin again"):
             return dict(read_json(path))
-        except (ValueError, TypeError, InputError) as error:
-            what = f"does not identify the run of the frames beside it ({error})"
-            raise InputError(what, path, "leave out resume=True to begin again") from None
 
 
 def check_same_run(
@@ -260,11 +228,11 @@ class Recorder:
     """Stores the finished frames of a run in memory.
 
     Attributes:
-        rows: finished frame -> column of results.csv -> value.
+        rows: rows of results.csv of the finished frames.
     """
 
     def __init__(self) -> None:
-        self.rows: dict[int, Row] = {}
+        self.rows = RowTable()
         self._writer: MapWriter | None = None
         self._stack = ExitStack()
 
@@ -290,7 +258,7 @@ class Recorder:
             contact: arrays of the contact result (`contact_arrays`); None: contact failed or is not
                 modelled.
         """
-        self.rows[frame] = row
+        self.rows.add(frame, row)
         if self._writer is None:
             return
         if contact is None:
@@ -362,9 +330,8 @@ class FolderRecorder(Recorder):
     def take_earlier(self, frames: range) -> dict[int, dict[str, Array] | None]:
         """See `Recorder`. Only frames before the first absent frame are read."""
         shards = {}
-        points = None if self._map_arguments is None else len(self._map_arguments[0])
         for frame in frames if self._shards.resumed else ():
-            shard = self._shards.get(frame, lambda one: _is_frame(one, points))
+            shard = self._shards.get(frame)
             if shard is None:
                 break
             shards[frame] = shard.contact
@@ -417,45 +384,26 @@ class FolderRecorder(Recorder):
         return results
 
 
-def _is_frame(shard: Shard, points: int | None) -> bool:
-    """Return whether a stored frame has the types and shapes of this run's frames.
-
-    Args:
-        shard: stored frame.
-        points: number of map points; None: no contact.
-    """
-    row = shard.row
-    numbers = [value for name, value in row.items() if name != "status"]
-    plain = all(value is None or type(value) in (int, float, bool) for value in numbers)
-    if not plain or not isinstance(row.get("status"), str) or type(row.get("time_s")) is not float:
-        return False
-    if shard.contact is None:
-        return True
-    if points is None:
-        return False
-    arrays, n = shard.contact, points
-    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(CONTACT_PLACES, (3, 3))
-    shapes |= {"pressure": (n,), "gap": (n,), "nodal_force": (n, 3), "pose": (4, 4)}
-    are_numbers = all(array.dtype.kind == "f" for array in arrays.values())
-    return are_numbers and all(
-        name in arrays and arrays[name].shape == shapes[name] for name in shapes
-    )
-
-
 @contextmanager
 def interrupt_later() -> Iterator[None]:
-    """Delay Ctrl-C until the end of the block."""
+    """Delay Ctrl-C and SIGTERM until the end of the block."""
     if threading.current_thread() is not threading.main_thread():  # only it receives signals
         yield
         return
     received: list[Any] = []
-    handler = signal.signal(signal.SIGINT, lambda *arguments: received.append(arguments))
+    handlers = {
+        number: signal.signal(number, lambda *arguments: received.append(arguments))
+        for number in (signal.SIGINT, signal.SIGTERM)
+        if callable(signal.getsignal(number))
+    }
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, handler)
-    if received and callable(handler):
-        handler(*received[0])
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    for number, frame in received[:1]:
+        if callable(handler := handlers[number]):
+            handler(number, frame)
 
 
 def finished_results(directory: Path, identity: Mapping[str, Any]) -> "Results | None":
@@ -464,6 +412,7 @@ def finished_results(directory: Path, identity: Mapping[str, Any]) -> "Results |
     Raises:
         InputError: the results are of another run, or have changed since they were written.
     """
+    settle(directory)
     if not os.path.exists(directory / SUMMARY_NAME):
         return None
     results = read_results(directory)

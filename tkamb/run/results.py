@@ -1,18 +1,19 @@
 """The results of a run: columns with one row per frame, pressure maps, and summary."""
 
 import csv
-import io
 import math
-from collections.abc import Callable, Iterable, Mapping
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
+from sys import intern
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tkamb.errors import InputError, names_near, not_installed
-from tkamb.files import FILE_LIMITS, read_text
+from tkamb.files import FILE_LIMITS, open_regular, undamaged
 from tkamb.geometry.frames import Array
 from tkamb.run.columns import KINDS, RENAMED, in_a_family, ordered_names
 
@@ -208,9 +209,11 @@ def read_csv(path: str | Path) -> dict[str, Any]:
     Raises:
         InputError: no such file, an unknown column, a row of another length, or a bad number.
     """
-    path = Path(path)
-    cells = _cells_of(path)
-    return {name: _parse(name, values, path) for name, values in cells.items()}
+    columns = _read_columns(Path(path))
+    for name in columns:
+        if name not in KINDS and not in_a_family(name):
+            raise InputError(f"unknown column '{name}'", path, names_near(name, KINDS))
+    return columns
 
 
 def read_bands(path: str | Path) -> dict[str, Array]:
@@ -219,60 +222,54 @@ def read_bands(path: str | Path) -> dict[str, Array]:
     Raises:
         InputError: no such file, a row of another length, or a bad number.
     """
-    path = Path(path)
-    return {name: _numbers(name, cells, path) for name, cells in _cells_of(path).items()}
+    return _read_columns(Path(path))
 
 
-def _cells_of(path: Path) -> dict[str, tuple[str, ...]]:
-    """Return column -> cells of a table. Column names of earlier releases become the new ones."""
+def _read_columns(path: Path) -> dict[str, Any]:
+    """Return the columns of a table. Names of earlier releases become the new ones.
+
+    The rows are read one by one, so that their text is never in memory as a whole.
+    """
+    descriptor = open_regular(path, FILE_LIMITS.table_bytes)
+    with undamaged(path), open(descriptor, encoding="utf-8", newline="") as file:
+        rows = csv.reader(file)
+        header = [RENAMED.get(name, name) for name in next(rows, ())]
+        if not header:
+            raise InputError("is empty", path, "run the scene again")
+        columns: list[Any] = [[] if KINDS.get(name) == "text" else array("d") for name in header]
+        for number, row in enumerate(rows, start=2):
+            if len(row) != len(header):
+                what = f"line {number} has {len(row)} cells, not {len(header)}"
+                raise InputError(what, path)
+            for name, column, cell in zip(header, columns, row, strict=True):
+                column.append(_value(name, cell) if isinstance(column, array) else intern(cell))
+    return {
+        name: np.array(column) if isinstance(column, array) else column
+        for name, column in zip(header, columns, strict=True)
+    }
+
+
+def _value(name: str, cell: str) -> float:
     try:
-        rows = list(csv.reader(io.StringIO(read_text(path, FILE_LIMITS.table_bytes))))
-    except csv.Error as error:
-        raise InputError(f"cannot be read as CSV ({error})", path) from None
-    if not rows:
-        raise InputError("is empty", path, "run the scene again")
-    header, body = [RENAMED.get(name, name) for name in rows[0]], rows[1:]
-    for number, row in enumerate(body, start=2):
-        if len(row) != len(header):
-            raise InputError(f"line {number} has {len(row)} cells, not {len(header)}", path)
-    cells = list(zip(*body, strict=True)) or [() for _ in header]
-    return dict(zip(header, cells, strict=True))
+        return float(cell) if cell else math.nan
+    except ValueError as error:
+        raise ValueError(f"column '{name}': {error}") from None
 
 
-def csv_text(columns: Mapping[str, Any]) -> str:
-    """Return the text of a results.csv: numbers without rounding, NaN as an empty cell."""
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(columns)
+def csv_rows(columns: Mapping[str, Any]) -> Iterator[Sequence[str]]:
+    """Yield the rows of a results.csv: numbers without rounding, NaN as an empty cell."""
+    yield list(columns)
     cells = [_cells(KINDS.get(name, "number"), values) for name, values in columns.items()]
-    writer.writerows(zip(*cells, strict=True))
-    return buffer.getvalue()
+    yield from zip(*cells, strict=True)
 
 
-def _cells(kind: str, values: Iterable[Any]) -> list[str]:
-    """Return the cells of a column."""
+def _cells(kind: str, values: Iterable[Any]) -> Iterator[str]:
+    """Yield the cells of a column."""
     if kind == "text":
-        return [str(value) for value in values]
-    numbers = [float(value) for value in values]
-    if kind == "integer":
-        return ["" if math.isnan(number) else _integer(number) for number in numbers]
-    return ["" if math.isnan(number) else repr(number) for number in numbers]
+        return map(str, values)
+    text = _integer if kind == "integer" else repr
+    return ("" if math.isnan(number) else text(number) for number in map(float, values))
 
 
 def _integer(number: float) -> str:
     return str(int(number)) if number.is_integer() else repr(number)
-
-
-def _parse(name: str, cells: tuple[str, ...], path: Path) -> Any:
-    if KINDS.get(name) == "text":
-        return list(cells)
-    if name not in KINDS and not in_a_family(name):
-        raise InputError(f"unknown column '{name}'", path, names_near(name, KINDS))
-    return _numbers(name, cells, path)
-
-
-def _numbers(name: str, cells: tuple[str, ...], path: Path) -> Array:
-    try:
-        return np.array([float(cell) if cell else math.nan for cell in cells])
-    except ValueError as error:
-        raise InputError(f"column '{name}': {error}", path) from None

@@ -6,27 +6,27 @@ import math
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb import __version__, code_identity
 from tkamb.errors import InputError
 from tkamb.files import (
-    FILE_LIMITS,
     MEGABYTE,
     Replacement,
+    check_replaced,
     read_json,
     replaced_together,
     sha256_of,
+    write_rows,
     write_synced,
 )
-from tkamb.io.claim import claimed_directory, settle
-from tkamb.run.identity import CONTACT_CODE, contact_code
-from tkamb.run.results import Results, csv_text, read_bands, read_csv
+from tkamb.io.claim import claimed_directory
+from tkamb.run.results import Results, csv_rows, read_bands, read_csv
 from tkamb.run.summary_check import check_summary
+from tkamb.run.table_metadata import table_metadata
 
 if TYPE_CHECKING:
     from tkamb.run.maps import ContactMaps
@@ -38,6 +38,7 @@ OWN_NAMES = (IDENTITY_NAME, "contact.h5", "*.frame", ".tkamb-*.part")
 """Patterns of the files in `.frames`. No other file is removed from it."""
 CSV_NAME, SUMMARY_NAME, REPORT_NAME = "results.csv", "summary.json", "report.html"
 MAPS_NAME = "contact.h5"
+METADATA_NAME = "results.csv-metadata.json"
 BANDS_NAME, TORNADO_NAME, SAMPLES_NAME = "bands.csv", "tornado.csv", "samples.h5"
 INDICES_NAME = "indices.csv"
 UNCERTAINTY_NAMES = (BANDS_NAME, TORNADO_NAME, SAMPLES_NAME, INDICES_NAME)
@@ -49,17 +50,15 @@ SUMMARY_LIMIT = 256 * MEGABYTE
 def read_results(directory: str | Path, *, check: bool = True) -> Results:
     """Read results from a folder. The numbers are exactly the written ones.
 
-    If writing was interrupted, it is completed first.
-
     Args:
-        directory: results folder.
+        directory: results folder. Nothing is written into it.
         check: whether to compare the files with the SHA-256 in summary.json.
 
     Raises:
         InputError: a file is missing, has a wrong format, or has changed since it was written.
     """
     directory = Path(directory)
-    settle(directory)
+    check_replaced(directory)
     if not os.path.exists(directory / CSV_NAME):  # unlike Path.exists, it never raises
         hint = "give a folder that `tkamb run` wrote"
         if os.path.exists(scene := directory / "scene.toml"):
@@ -168,7 +167,8 @@ def put_numbers(results: Results, files: Replacement) -> None:
         files: replacement of the folder's files. A contact.h5 of the folder is kept if the
             replacement has none; old files of `UNCERTAINTY_NAMES` are removed.
     """
-    write_synced(files.path(CSV_NAME), csv_text(results.columns))
+    write_rows(files.path(CSV_NAME), csv_rows(results.columns))
+    write_synced(files.path(METADATA_NAME), table_metadata(results.columns, results.summary))
     recorded = {CSV_NAME: sha256_of(files.path(CSV_NAME))}
     if results.maps is None:
         files.remove(MAPS_NAME)
@@ -216,87 +216,6 @@ def _put_maps(maps: "ContactMaps | None", files: Replacement) -> None:
     from tkamb.run.maps import write_maps
 
     write_maps(maps, files.path(MAPS_NAME))
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """The verification of a results folder.
-
-    Args:
-        differs: messages on changed files.
-        notes: messages on other facts, such as another version of the code.
-        inputs: number of checked input files.
-    """
-
-    differs: tuple[str, ...]
-    notes: tuple[str, ...]
-    inputs: int
-
-    def lines(self) -> list[str]:
-        """Return the messages as lines of text."""
-        end = f"results and {self.inputs} input file(s) have not changed since the run"
-        return [*self.differs, *self.notes, *([] if self.differs else [end])]
-
-
-def verify_results(directory: str | Path) -> Verdict:
-    """Compare a folder with the SHA-256 in its summary.json.
-
-    If writing was interrupted, it is completed first.
-
-    Raises:
-        InputError: it is not a results folder.
-    """
-    directory = Path(directory)
-    settle(directory)
-    summary = read_summary(directory)
-    if not isinstance(summary.get("versions"), Mapping):
-        raise InputError("was not written by tkamb run", directory / SUMMARY_NAME)
-    changes = differences(directory, summary)
-    if not isinstance(summary.get("files"), Mapping):
-        changes.append("has no SHA-256: an earlier tkamb wrote it, so nothing can be checked")
-    try:
-        read_results(directory, check=False)
-    except InputError as error:
-        changes.append(str(error))
-    inputs = summary.get("inputs")
-    inputs = inputs if isinstance(inputs, Mapping) else {}
-    changes += [line for path, recorded in inputs.items() if (line := _input(path, recorded))]
-    return Verdict(tuple(changes), tuple(_notes(summary)), len(inputs))
-
-
-def _input(path: str, recorded: str) -> str | None:
-    """Return a message on an input file; None: it has not changed."""
-    try:
-        same = sha256_of(path, FILE_LIMITS.mesh_bytes) == recorded  # the limit of input files
-    except InputError as error:
-        return f"input {error}"
-    return None if same else f"input {path} has changed since it was read"
-
-
-def _notes(summary: Mapping[str, Any]) -> list[str]:
-    identity = summary.get("identity")
-    identity = identity if isinstance(identity, Mapping) else {}
-    notes, made_by = [], identity.get("version of tkamb")
-    code, this = str(identity.get("code of tkamb")), code_identity()
-    if made_by != __version__ or code != this:
-        notes.append(
-            f"computed by other code (tkamb {made_by}, {code[:12]}; "
-            f"this is {__version__}, {this[:12]})"
-        )
-    contact = summary.get("contact")
-    if CONTACT_CODE in identity and isinstance(contact, Mapping):
-        notes += _plug_in_note(str(contact.get("model")), identity[CONTACT_CODE])
-    if summary.get("unfinished_frames"):
-        notes.append(f"unfinished: {summary['unfinished_frames']} frames are still to be computed")
-    return notes
-
-
-def _plug_in_note(model: str, code: str) -> list[str]:
-    try:
-        same = contact_code(model) == code
-    except InputError as error:
-        return [f"the code of the contact model cannot be compared: {error}"]
-    return [] if same else [f"computed by another code of the contact model '{model}'"]
 
 
 def remove_shards(directory: Path, name: str = FOLDER) -> None:

@@ -24,7 +24,7 @@ from tkamb.run.recorder import FolderRecorder, Recorder, Row, finished_results
 from tkamb.run.results import Results
 from tkamb.run.status import frame_status
 from tkamb.run.summary import summary_of
-from tkamb.run.tabulate import frame_row, join_rows
+from tkamb.run.tabulate import frame_row
 from tkamb.run.workers import PoolOptions, Task, WorkerPool
 
 if TYPE_CHECKING:
@@ -311,7 +311,7 @@ class _Run:
 
     def results(self) -> Results:
         """Return the results. Frames that are not computed yet are failed frames."""
-        columns = join_rows(self.case, self.indices, self.recorder.rows)
+        columns = self.recorder.rows.columns(self.case, self.indices)
         self.seconds["all"] = clock.perf_counter() - self.start
         strains = self.solver.mechanics.strains
         summary = summary_of(self.case, columns, self.seconds, self.path, strains)
@@ -319,6 +319,7 @@ class _Run:
         if muscles is not None:
             summary["muscle_groups"] = muscles.groups
         plausibility = self.solver.plausibility
+        summary["remarks"] = list(self.case.remarks)
         summary["questions"] = [question.text for question in plausibility.questions]
         summary["notes"] += plausibility.answered
         summary["identity"] = self.identity
@@ -345,7 +346,9 @@ class _Run:
             "frame": "insert: x anterior, y superior, z lateral",
             "model": side.model.name,
             "version": str(self.identity["version of tkamb"]),
-            "scene_sha256": scene_hash(self.case),
+            "scene_sha256": scene_hash(self.case.scene),
+            "licence": self.case.scene.output.licence or "not stated",
+            "creator": f"tkamb {self.identity['version of tkamb']}",
         }
         self.recorder.begin_maps(side.state.points, side.state.triangles, labels)
 

@@ -172,6 +172,8 @@ def frame_status(
     words += _patella_flags(case, body)
     if body.loads.slack and body.geometry.share is None:
         words.append("flexors needed, which are not modelled: quadriceps slack")
+    if body.geometry.share is not None and not body.geometry.share.both_loaded:
+        words.append("no muscle forces keep the least share of load on each condyle")
     if body.loads.ambiguous:
         words.append("several load states are in equilibrium: the one with most loads is used")
     words += contradictions(case, body, contact)

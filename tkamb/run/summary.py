@@ -16,7 +16,9 @@ from tkamb.geometry.frames import SIDES
 from tkamb.io.recordings.gait_cycle import GAIT, cycle_percent
 from tkamb.io.scene.case import Case
 from tkamb.io.scene.scene import Scene
-from tkamb.io.scene.tables import ContactTable, MusclesTable
+from tkamb.io.scene.tables import ContactTable
+from tkamb.run import texts
+from tkamb.run.claims import claims_summary
 from tkamb.run.columns import (
     ACTIVATION,
     JOINT_MOMENT,
@@ -27,10 +29,9 @@ from tkamb.run.columns import (
     name_in,
 )
 from tkamb.run.discrepancy import discrepancy_summary
-from tkamb.run.identity import scene_hash
+from tkamb.run.identity import relative_paths, scene_hash
 from tkamb.run.known_errors import as_json, known_error, left_out
 from tkamb.run.read_scene import STRAIN_FLEXIONS
-from tkamb.run.recorded import predicted_columns
 from tkamb.run.settings import changed_settings
 from tkamb.run.status import FAILED
 from tkamb.units import DEGREE, MILLIMETRE
@@ -40,11 +41,6 @@ RESIDUALS = (
     "about the tibia's long axis that equilibrium needs beyond the modelled loads. They act at the "
     "midpoint of the contact points. An exact model has none. Results also contain the largest "
     "change of the total force if they act 10 mm above or below this midpoint."
-)
-
-POST_HELD = (
-    "Cam and post: the post is fixed at its anterior face, so that it does not bend at its root. "
-    "Friction is that of the condyles. force_si_N and the other contact forces include the post."
 )
 
 
@@ -90,7 +86,10 @@ def summary_of(
     summary["not_modelled"] = not_modelled(case)
     summary["assumptions"] = assumptions(case)
     summary["notes"] = notes_of(scene)
-    summary["scene_tables"] = scene.model_dump(mode="json", exclude_none=True, exclude={"output"})
+    tables = scene.model_dump(exclude_none=True, exclude={"output"})
+    summary["scene_tables"] = relative_paths(
+        tables, None if path is None else path.absolute().parent
+    )
     if changed := changed_settings():
         summary["changed_settings"] = changed
     if strains:
@@ -100,7 +99,7 @@ def summary_of(
     if scene.muscles:
         summary["reserves"] = reserves(columns)
         summary["saturated_muscles"] = saturated_muscles(columns)
-    summary["peaks_BW"] = peaks(columns, case.body_weight)
+    summary |= claims_summary(columns, case.body_weight)
     summary["measures"] = measures(case, columns)
     if scene.contact or scene.muscles:
         summary["discrepancy"] = discrepancy_summary(summary)
@@ -227,7 +226,7 @@ def _origin(case: Case, path: Path | None) -> dict[str, Any]:
     """Return scene file, overrides, preset, time, command and versions of the run."""
     return {
         "scene": None if path is None else str(path.absolute()),
-        "scene_sha256": scene_hash(case),
+        "scene_sha256": scene_hash(case.scene),
         "overrides": case.scene.overrides,
         "preset": None if case.scene.preset is None else case.scene.preset.as_dict(),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -249,6 +248,7 @@ def _subject(case: Case) -> dict[str, Any]:
         "yield_stress_MPa": case.scene.yield_stress_MPa,
         "axis": output.axis,
         "activity": output.activity,
+        "licence": output.licence,
     }
 
 
@@ -286,115 +286,36 @@ def not_modelled(case: Case) -> list[str]:
 
 
 def assumptions(case: Case) -> list[str]:
-    """Return the assumptions of a run as sentences."""
-    scene = case.scene
-    sentences = [
-        "Segments are rigid. The force and the moment at the hip are sums over all structures that "
-        "cross the hip.",
-    ]
-    if scene.preset is not None:
-        sentences += scene.preset.sentences()
-    if scene.motion.cutoff_Hz == "none":
-        sentences.append(
-            "The motion is not filtered before velocities and accelerations are computed from it."
-        )
-    else:
-        sentences.append(f"The motion is low-passed at {scene.motion.cutoff_Hz:g} Hz.")
-    if case.ground is not None and case.ground.level_assumed:
-        sentences.append("The force plate is assumed at height 0 of the laboratory.")
-    if case.motion.unrecorded:
-        sentences.append(
-            f"{', '.join(case.motion.unrecorded)} were not recorded but computed. Their rates, for "
-            "inertia and the direction of sliding, are those of an initial guess."
-        )
-    if scene.motion.motion == "roll-slip":
-        sentences.append(
-            "Roll-slip motion: AP from rolling plus "
-            f"{scene.motion.slip_share:g} x the recorded slip, SI from first touch."
-        )
-    if scene.generic_ligaments:
-        sentences.append(
-            f"{', '.join(scene.generic_ligaments.ligaments)}: generic ligaments scaled to the "
-            "implant, not those of the patient; check the strains."
-        )
-    if case.motion.markers:
-        sentences.append(_marker_reading(case))
-    elif not scene.tibia:
-        sentences.append("No [tibia]: the shank is vertical and does not move.")
-    if scene.ground_reaction and scene.ground_reaction.applied == "ankle":
-        sentences.append(
-            "The ground reaction acts at the ankle centre, without moment (Sharma 2008)."
-        )
-    if scene.ground_reaction and scene.ground_reaction.force == "on the plate":
-        sentences.append("The recorded force is that on the plate: its signs are inverted.")
-    if not scene.patella:
-        sentences.append("No muscles: the knee's flexion moment is a residual.")
-    if scene.muscles:
-        sentences.append(_sharing(scene.muscles))
-        if scene.muscles.emg:
-            sentences.append(scene.muscles.emg.sentence)
-    if scene.contact:
-        sentences.append(_agreement(scene.contact))
-        sentences += _bearing(scene)
-    if case.post is not None:
-        sentences.append(POST_HELD)
-    if scene.patient.side == "left":
-        sentences.append("A left knee is computed as its mirror image: z is lateral.")
-    return sentences
+    """Return the assumptions of a run as sentences (`assets/assumptions.txt`)."""
+    scene, insert = case.scene, case.scene.implant.insert
+    has_bearing = scene.contact is not None and insert is not None
+    return texts.lines(
+        "tkamb.run",
+        "assumptions.txt",
+        scene=scene,
+        preset=[] if scene.preset is None else scene.preset.sentences(),
+        level_assumed=case.ground is not None and case.ground.level_assumed,
+        unrecorded=case.motion.unrecorded,
+        markers=_marker_facts(case) if case.motion.markers else None,
+        emg=scene.muscles.emg.sentence if scene.muscles and scene.muscles.emg else "",
+        bearing=left_out(scene.contact.model, insert.bearing) if has_bearing else (),  # type: ignore[union-attr]
+        post=case.post is not None,
+    )
 
 
-def _marker_reading(case: Case) -> str:
-    """Return a sentence on the method for skin markers, and its difference from the other."""
+def _marker_facts(case: Case) -> dict[str, Any]:
+    """Return coordinates, method and differences of skin markers."""
     markers = case.motion.markers
     assert markers is not None and case.scene.motion.markers is not None
-    used = {
-        "segments": "separate fits of shank and thigh",
-        "chain": "a fit of segments with joints",
-    }
-    names = ", ".join(case.scene.motion.markers.coordinates)
     time = case.motion.time
     distance = markers.at(np.nan_to_num(markers.centre_distance), time).max() / MILLIMETRE
     difference = np.abs(markers.flexion["segments"] - markers.flexion["chain"])
-    difference = markers.at(np.nan_to_num(difference), time).max() / DEGREE
-    return (
-        f"Shank and {names} come from skin markers, by {used[markers.method]}. The knee "
-        f"centres of shank and thigh markers are up to {distance:.0f} mm apart. The flexions of "
-        f"the two methods (separate fits, fit with joints) differ by up to {difference:.1f} deg."
-    )
-
-
-def _sharing(table: MusclesTable) -> str:
-    """Return a sentence on the static optimisation."""
-    weights = "volume-weighted" if table.weights == "volume" else "equally weighted"
-    return (
-        f"The muscles of {table.model.name} share the joint moments by static optimisation: the "
-        f"least {weights} sum of activations to the power {table.exponent:g}, with reserves "
-        f"({table.law} strength). Hip loads are intersegmental, without muscles."
-    )
-
-
-def _agreement(table: ContactTable) -> str:
-    """Return a sentence on the coupling of body and contact."""
-    if table.released:
-        names = ", ".join(sorted({*table.released, "si"}))
-        return f"{names} are found by equilibrium of body and contact, not recorded."
-    sentence = (
-        "The contact model is loaded with the superior-inferior force at the measured rotation. "
-    )
-    if table.coupling == "points":
-        return sentence + "Its resultants act in the equations of motion."
-    return (
-        sentence
-        + "The result of the contact model does not change the forces in the equations of motion."
-    )
-
-
-def _bearing(scene: Scene) -> tuple[str, ...]:
-    """Return sentences on features of the bearing that the contact model lacks."""
-    insert = scene.implant.insert
-    if scene.contact is None or insert is None:
-        return ()
-    return left_out(scene.contact.model, insert.bearing)
+    return {
+        "names": case.scene.motion.markers.coordinates,
+        "method": markers.method,
+        "distance": distance,
+        "difference": markers.at(np.nan_to_num(difference), time).max() / DEGREE,
+    }
 
 
 def reserves(columns: Mapping[str, Any]) -> dict[str, dict[str, float]]:
@@ -429,27 +350,6 @@ def saturated_muscles(columns: Mapping[str, Any]) -> dict[str, int]:
             frames = int((np.asarray(values) > SATURATED).sum())
             if frames:
                 result[name_in(column, ACTIVATION)] = frames
-    return result
-
-
-def peaks(columns: Mapping[str, Any], body_weight: float) -> dict[str, dict[str, float]]:
-    """Return force -> its largest value, BW, with frame, time and flexion.
-
-    Args:
-        columns: columns of results.csv.
-        body_weight: body weight, N.
-    """
-    result = {}
-    for force, name in predicted_columns(columns).items():
-        values = columns.get(name)
-        if values is not None and np.isfinite(values).any():
-            frame = int(np.nanargmax(values))
-            result[force] = {
-                "nominal": float(values[frame]) / body_weight,
-                "frame": frame,
-                "time_s": float(columns["time_s"][frame]),
-                "flexion_deg": float(columns["flexion_deg"][frame]),
-            }
     return result
 
 

@@ -1,6 +1,9 @@
 """Rows and columns of results.csv from the frames, which are in SI units."""
 
+from array import array
 from collections.abc import Mapping
+from copy import deepcopy
+from sys import intern
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -77,21 +80,44 @@ def frame_row(
     return {name: float(value) for name, value in row.items()} | {"status": status}
 
 
-def join_rows(case: Case, frames: range, rows: Mapping[int, dict[str, Any]]) -> Columns:
-    """Return the columns of results.csv, one entry per frame.
+class RowTable:
+    """The rows of the finished frames, stored as columns of numbers."""
 
-    A frame without a row has its motion, NaN and the status "failed: not computed".
+    def __init__(self) -> None:
+        self._columns: dict[str, array[float]] = {}
+        self._statuses: list[str] = []
+        self._row_of: dict[int, int] = {}
 
-    Args:
-        case: the case.
-        frames: frames of the motion.
-        rows: frame -> row from `frame_row`.
-    """
-    missing = {"status": FAILED + "not computed"}
-    all_rows = [rows[k] if k in rows else _motion_row(case, k) | missing for k in frames]
-    names = dict.fromkeys(name for row in all_rows for name in row if name != "status")
-    columns: Columns = {n: np.array([row.get(n, NAN) for row in all_rows], float) for n in names}
-    return columns | {"status": [row["status"] for row in all_rows]}
+    def add(self, frame: int, row: Mapping[str, Any]) -> None:
+        """Add the row of a frame (`frame_row`)."""
+        count = len(self._row_of)
+        for name in row:
+            if name not in self._columns and name != "status":
+                self._columns[name] = array("d", [NAN]) * count
+        for name, column in self._columns.items():
+            column.append(row.get(name, NAN))
+        self._statuses.append(intern(row["status"]))
+        self._row_of[frame] = count
+
+    def __len__(self) -> int:
+        return len(self._row_of)
+
+    def __contains__(self, frame: object) -> bool:
+        return frame in self._row_of
+
+    def columns(self, case: Case, frames: range) -> Columns:
+        """Return the columns of results.csv, one entry per frame.
+
+        A frame without a row has its motion, NaN and the status "failed: not computed".
+        """
+        whole, rest = self, [k for k in frames if k not in self]
+        if rest:
+            whole = deepcopy(self)
+            for k in rest:
+                whole.add(k, _motion_row(case, k) | {"status": FAILED + "not computed"})
+        places = [whole._row_of[k] for k in frames]
+        columns: Columns = {name: np.array(each)[places] for name, each in whole._columns.items()}
+        return columns | {"status": [whole._statuses[place] for place in places]}
 
 
 def _motion_row(case: Case, k: int) -> dict[str, Any]:

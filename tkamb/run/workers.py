@@ -10,7 +10,6 @@ and content only.
 """
 
 import argparse
-import logging
 import os
 import pickle
 import queue
@@ -19,7 +18,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import IO, Any
@@ -49,58 +48,27 @@ FINISHED_KEPT = "what is finished is kept: go on with resume=True"
 
 
 def answers_of_cluster(
-    task: "Task", tasks: Sequence["Numbered"], address: str, workers: int
+    task: "Task", tasks: Sequence["Numbered"], address: str
 ) -> Iterator["Numbered"]:
     """Yield the numbers and answers of jobs in the order in which they finish.
 
     Args:
         task: task of the workers.
         tasks: numbers and contents of the jobs.
-        address: address of the scheduler, such as "tcp://host:8786"; "local": start one on this
-            machine.
-        workers: number of workers of a local scheduler.
+        address: address of the scheduler, such as "tcp://host:8786".
 
     Raises:
         InputError: Dask is not installed, or no scheduler answers.
         ComputationError: the scheduler has ended, or a job killed too many workers.
     """
     distributed = _library()
-    with ExitStack() as stack:
-        place = address
-        if address == LOCAL:
-            place = stack.enter_context(
-                distributed.LocalCluster(
-                    n_workers=workers,
-                    threads_per_worker=1,
-                    dashboard_address=None,
-                    silence_logs=logging.CRITICAL,
-                    protocol="tls://",
-                    security=_own_security(distributed),
-                )
-            )
-        client = stack.enter_context(_connected(distributed, place, address))
+    with _connected(distributed, address) as client:
         yield from _answers(distributed, client, task, tasks)
-
-
-def _own_security(distributed: Any) -> Any:
-    """Return certificates for this process.
-
-    A scheduler without certificates executes code from every user of the machine.
-    """
-    try:
-        return distributed.Security.temporary()
-    except ImportError:
-        hint = "pip install 'tkamb[cluster]'"
-        raise InputError("cryptography is not installed", "--dask local", hint) from None
 
 
 def check_cluster(address: str) -> None:
     """Raise an InputError if Dask is not installed, or no scheduler answers."""
-    distributed = _library()
-    if address == LOCAL:
-        _own_security(distributed)
-    else:
-        _connected(distributed, address, address).close()
+    _connected(_library(), address).close()
 
 
 def _library() -> Any:
@@ -115,15 +83,15 @@ def _library() -> Any:
     return distributed
 
 
-def _connected(distributed: Any, place: Any, address: str) -> Any:
+def _connected(distributed: Any, address: str) -> Any:
     """Return a client of the scheduler."""
     try:
-        return distributed.Client(place, timeout=CLUSTER.answer_seconds)
+        return distributed.Client(address, timeout=CLUSTER.answer_seconds)
     except (OSError, ValueError, TypeError) as error:  # no answer, or an invalid address
         raise InputError(
             f"no Dask scheduler answers at '{address}' ({type(error).__name__})",
             "--dask",
-            "start one (`dask scheduler`), or give --dask local",
+            "start one (`dask scheduler`), or give --workers N",
         ) from None
 
 
@@ -213,8 +181,8 @@ class PoolOptions:
 
     Args:
         workers: number of worker processes; 1: the jobs are computed in this process.
-        dask: address of a Dask scheduler; "local": start one with `workers` workers; None: no
-            cluster.
+        dask: address of a Dask scheduler; None or "local": the worker processes. They have no
+            scheduler, and no port that others could reach.
 
     Raises:
         InputError: too few or too many workers.
@@ -224,6 +192,8 @@ class PoolOptions:
     dask: str | None = None
 
     def __post_init__(self) -> None:
+        if self.dask == LOCAL:
+            object.__setattr__(self, "dask", None)
         if not 1 <= self.workers <= WORKER_LIMITS.max_workers:
             raise InputError(
                 f"cannot be {self.workers}",
@@ -306,7 +276,7 @@ class WorkerPool:
             ComputationError: a worker was killed, or the scheduler has ended.
         """
         if self._crew.dask is not None and tasks:
-            yield from answers_of_cluster(self._task, tasks, self._crew.dask, self._crew.workers)
+            yield from answers_of_cluster(self._task, tasks, self._crew.dask)
             return
         if not self.processes:
             yield from _answers_here(self._task, tasks)

@@ -1,7 +1,7 @@
 """The report's horizontal axis, and a choice of frames that represent the motion."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +13,9 @@ from tkamb.geometry.frames import Array
 if TYPE_CHECKING:
     from tkamb.run.results import Results
 
+EVENLY_SHOWN = 300
+"""1: frames that a page shows evenly over a longer recording. A plot has 700 pixels; at 300 frames
+the page of the shipped knee has 4 MB."""
 LABELS = {"flexion": "flexion (deg)", "cycle": "cycle (%)", "time": "time (s)"}
 UNITS = {"flexion": "°", "cycle": " %", "time": " s"}
 
@@ -123,3 +126,29 @@ def _stances_in_cycle(results: "Results") -> tuple[tuple[float, float], ...]:
     scale = 100.0 / (end - start)
     spans = _stances(results, start, end)
     return tuple((scale * (on - start), scale * (off - start)) for on, off in spans)
+
+
+def shown_frames(results: "Results") -> NDArray[np.int64]:
+    """Return the frames that a page shows: all, or `EVENLY_SHOWN` and those of the largest values.
+
+    The largest absolute value of every column is then in the plots, too.
+    """
+    count = len(results)
+    if count <= EVENLY_SHOWN:
+        return np.arange(count)
+    columns = [values for name, values in results.columns.items() if name != "status"]
+    peaks = [np.nanargmax(np.abs(one)) for one in columns if np.isfinite(one).any()]
+    even = np.round(np.linspace(0, count - 1, EVENLY_SHOWN)).astype(int)
+    return np.unique([*even, *peaks])
+
+
+def results_at(results: "Results", frames: NDArray[np.int64]) -> "Results":
+    """Return the results of some frames with the summary and the maps of all."""
+    if len(frames) == len(results):
+        return results
+    columns = {
+        name: [values[k] for k in frames] if isinstance(values, list) else values[frames]
+        for name, values in results.columns.items()
+    }
+    bands = {name: values[frames] for name, values in results.bands.items()}
+    return replace(results, columns=columns, bands=bands)

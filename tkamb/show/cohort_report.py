@@ -103,7 +103,7 @@ def _error_card(cohort: Cohort, outcomes: Mapping[int, Outcome]) -> Card | None:
         return None
     detail = " ".join([*words.values(), OTHER_ERRORS])
     number = f"{len(words)} setting{'s' * (len(words) > 1)}"
-    return Card("Known error of the contact model", number, detail, large)
+    return Card("Known error of the contact model", number, detail, warning=large)
 
 
 def _there(groups: Sequence[Group]) -> list[str]:
@@ -126,12 +126,19 @@ def _cards(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Gro
     failures = sum(one.failed_frames for one in outcomes.values())
     detail = f"{failed} failed: listed at the end" if failed else "none failed"
     result = [
-        Card("Runs computed", f"{len(outcomes) - failed} of {len(outcomes)}", detail, failed > 0)
+        Card(
+            "Runs computed",
+            f"{len(outcomes) - failed} of {len(outcomes)}",
+            detail,
+            warning=failed > 0,
+        )
     ]
     words = "failed frames have no numbers" if failures else "none failed"
     if flagged := sum(one.flagged_frames for one in outcomes.values()):
         words += f"; {flagged} to be read with care, see their status in cohort.parquet"
-    result.append(Card("Frames computed", f"{frames - failures} of {frames}", words, failures > 0))
+    result.append(
+        Card("Frames computed", f"{frames - failures} of {frames}", words, warning=failures > 0)
+    )
     name = "force_total_BW"
     means = {
         group.name: float(np.nanmean(group.peaks[name])) for group in groups if name in group.peaks
@@ -164,7 +171,7 @@ def _wear_card(outcomes: Mapping[int, Outcome], groups: Sequence[Group]) -> Card
     )
     if lost:
         text += f". {lost} runs have none, see wear_failed in runs.csv"
-    return Card("Worn volume", value, text, lost > 0)
+    return Card("Worn volume", value, text, warning=lost > 0)
 
 
 def _wear_table(groups: Sequence[Group]) -> dict[str, Any] | None:

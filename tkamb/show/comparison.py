@@ -10,13 +10,13 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, Index
 from tkamb.run import metrics
+from tkamb.run.claims import peaks_of
 from tkamb.run.columns import KINDS
 from tkamb.run.identity import CONTACT_CODE
 from tkamb.run.metrics import failed
 from tkamb.run.results import Results
 from tkamb.run.results_folder import read_results
 from tkamb.show.axis import HorizontalAxis, horizontal_axis
-from tkamb.show.headline import peaks_of
 
 if TYPE_CHECKING:
     from tkamb.run.results import Results
@@ -106,8 +106,6 @@ def _same_frames(
 
 NOT_COMPARED = ("time_s", "body_seconds", "query_seconds", "contact_seconds")
 SETTINGS = {
-    "scene": "scene file",
-    "scene_sha256": "scene (SHA-256 of all its keys)",
     "side": "side",
     "lateral_axis": "direction of insert z",
     "body_mass_kg": "body mass, kg (so 1 BW is not the same force)",
@@ -207,7 +205,7 @@ class Comparison:
                     "contact": run.results.summary.get("contact"),
                     "frames": len(run.results),
                     "failed_frames": int(failed(run.results).sum()),
-                    "peaks_BW": peaks_of(run.results.summary),
+                    "peaks_BW": peaks_of(run.results),
                     "peak_pressure": metrics.peak_pressure(run.results),
                     "paired": _pairing_word(run.pairing),
                 }
@@ -311,12 +309,53 @@ def _notes(runs: Sequence[Run]) -> list[str]:
     tables = [run.results.summary.get("contact") or {} for run in runs]
     for key in sorted({key for table in tables for key in table}):
         notes += _unlike(runs, f"contact, {key}", [_whole(table.get(key)) for table in tables])
+    notes += _unlike_tables(runs)
+    notes += _unlike_inputs(runs)
+    versions = [run.results.summary.get("versions") or {} for run in runs]
+    for name in sorted({name for one in versions for name in one}):
+        notes += _unlike(runs, f"the version of {name}", [one.get(name) for one in versions])
     for code in ("code of tkamb", CONTACT_CODE):
         codes = [(run.results.summary.get(VERSIONS) or {}).get(code) for run in runs]
         notes += _unlike(runs, code, codes)
     for run in runs:
         notes += _frames_note(runs[0], run)
     return notes
+
+
+def _unlike_tables(runs: Sequence[Run]) -> list[str]:
+    """Return a sentence for each key of the scenes that differs. [contact] has its own."""
+    tables = [_flat(run.results.summary.get("scene_tables") or {}) for run in runs]
+    names = dict.fromkeys(name for table in tables for name in table)
+    return [
+        note
+        for name in names
+        if not name.startswith("contact.") and name.partition(".")[0] != "base"
+        for note in _unlike(runs, f"the setting {name}", [table.get(name) for table in tables])
+    ]
+
+
+def _flat(value: Any, name: str = "") -> dict[str, Any]:
+    """Return dotted key -> value of nested tables. Entries of lists of tables have numbers."""
+    if isinstance(value, list) and any(isinstance(one, dict) for one in value):
+        value = {str(one.get("name", k)): one for k, one in enumerate(value)}
+    if not isinstance(value, dict):
+        return {name: value if not isinstance(value, list) else str(value)}
+    prefix = f"{name}." if name else ""
+    return {k: v for key, one in value.items() for k, v in _flat(one, f"{prefix}{key}").items()}
+
+
+def _unlike_inputs(runs: Sequence[Run]) -> list[str]:
+    """Return a sentence for each input file whose content differs.
+
+    Scene files have sentences on their keys. A file that only some runs read is in a setting.
+    """
+    inputs = [run.results.summary.get("inputs") or {} for run in runs]
+    return [
+        note
+        for name in dict.fromkeys(name for one in inputs for name in one)
+        if all(name in one for one in inputs) and not name.endswith(".toml")
+        for note in _unlike(runs, f"the input file {name}", [one[name] for one in inputs])
+    ]
 
 
 def _unlike(runs: Sequence[Run], words: str, values: Sequence[Any]) -> list[str]:

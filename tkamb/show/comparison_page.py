@@ -13,10 +13,11 @@ from matplotlib.figure import Figure
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, Index
 from tkamb.run import metrics
+from tkamb.run.claims import split_of
 from tkamb.run.metrics import failed, map_rows, medial_share, residual_share, tension_ratio
 from tkamb.show.axis import UNITS
 from tkamb.show.comparison import Comparison, Difference, Run
-from tkamb.show.headline import muscle_limits, peak_legend, peak_words, peaks_of
+from tkamb.show.headline import limits_line, peak_lines
 from tkamb.show.pages import asset, policy_sources, render
 from tkamb.show.pressure_maps import draw_map, pressure_bar, top_view
 from tkamb.show.style import CYCLE, new_figure, settings, svg_text
@@ -68,11 +69,18 @@ def _both(title: str, unit: str, column: str) -> tuple[Quantity, ...]:
     )
 
 
+def determined_share(results: "Results") -> Array:
+    """Return the medial share by deformation (f,); NaN where adduction does not determine it."""
+    undetermined = split_of(results.columns).undetermined
+    return np.where(undetermined, np.nan, medial_share(results, "deformation"))
+
+
 QUANTITIES = (
     _column("Contact force, total", "BW", "force_total_BW"),
-    Quantity("Medial share by deformation", "–", lambda r: medial_share(r, "deformation")),
-    *_both("Force by deformation", "N", "force_N"),
+    Quantity("Medial share by equilibrium", "–", lambda r: medial_share(r, "equilibrium")),
+    Quantity("Medial share by deformation", "–", determined_share),
     *_both("Force by equilibrium", "N", "force_equilibrium_N"),
+    *_both("Force by deformation", "N", "force_N"),
     *_both("Peak pressure", "MPa", "peak_pressure_MPa"),
     *_both("Contact area", "mm²", "area_mm2"),
     *_both("Centre of pressure, anterior", "mm", "cop_ap_mm"),
@@ -172,7 +180,7 @@ def _map_at(results: "Results", frame: int) -> Array | None:
     row = map_rows(results).get(frame)
     if results.maps is None or row is None:
         return None
-    return results.maps.pressure_Pa[row] / MEGAPASCAL
+    return results.maps.rows("pressure_Pa", [row])[0] / MEGAPASCAL
 
 
 def _map_figure(
@@ -207,7 +215,8 @@ POLICY = (
     "img-src data:; base-uri 'none'; form-action 'none'"
 )
 FIRST = (
-    "force_total_N", "force_total_BW", "medial_force_N", "lateral_force_N",
+    "force_total_N", "force_total_BW", "medial_force_equilibrium_N", "lateral_force_equilibrium_N",
+    "medial_force_N", "lateral_force_N",
     "medial_peak_pressure_MPa", "lateral_peak_pressure_MPa", "medial_area_mm2", "lateral_area_mm2",
     "medial_cop_ap_mm", "lateral_cop_ap_mm", "quadriceps_N", "patellar_ligament_N",
     "patellofemoral_N", "approach_mm",
@@ -253,7 +262,7 @@ def comparison_html(comparison: Comparison, frame: int | None = None) -> str:
         title=" and ".join(run.label for run in comparison.runs),
         kind=comparison.kind,
         runs=[_run(comparison, number) for number in range(len(comparison.runs))],
-        peaks=peak_lines(comparison),
+        peaks=run_lines(comparison),
         notes=comparison.notes,
         plots=_plots(comparison),
         maps=None if maps is None else svg_text(maps, "maps"),
@@ -304,21 +313,17 @@ def _rows(comparison: Comparison, differences: Sequence[Difference]) -> list[lis
     ]
 
 
-def peak_lines(comparison: Comparison) -> list[str]:
+def run_lines(comparison: Comparison) -> list[str]:
     """Return lines with each run's peak forces and bands, peak pressure and muscles at a limit."""
     lines = []
     for run in comparison.runs:
-        peaks = peaks_of(run.results.summary)
-        if peaks:
-            words = ", ".join(f"{name} {peak_words(one)}" for name, one in peaks.items())
-            lines.append(f"{run.label}: peak {words} BW, {peak_legend(peaks)}")
+        words = peak_lines(run.results)
         if pressure := metrics.peak_pressure(run.results):
-            words = f"peak pressure {pressure['MPa']:.1f} MPa, {pressure['side']}"
-            words += f", at {pressure['time_s']:.4g} s"
-            words += f", where {pressure['doubt']}" if pressure["doubt"] else ""
-            lines.append(f"{run.label}: {words}")
-        limits = muscle_limits(run.results)
-        lines += [f"{run.label}: {limits.line()}"] if limits is not None else []
+            doubt = f", where {pressure['doubt']}" if pressure["doubt"] else ""
+            place = f"{pressure['side']}, at {pressure['time_s']:.4g} s{doubt}"
+            words.append(f"peak pressure {pressure['MPa']:.1f} MPa, {place}")
+        limits = limits_line(run.results)
+        lines += [f"{run.label}: {one}" for one in [*words, *([limits] if limits else [])]]
     return lines
 
 
@@ -331,4 +336,4 @@ def table_lines(comparison: Comparison) -> list[str]:
     if len(rows) == 1:
         table = ["no differences could be computed"]
     notes = [f"note: {note}" for note in comparison.notes]
-    return [*peak_lines(comparison), *notes, *(line.rstrip() for line in table)]
+    return [*run_lines(comparison), *notes, *(line.rstrip() for line in table)]

@@ -61,7 +61,7 @@ def draw_insert(view: TopView, largest: float) -> Figure:
 def largest_pressure(results: "Results") -> float:
     """Return the upper end of the colour scale, MPa: the largest pressure, or 1 if it is zero."""
     assert results.maps is not None
-    return float(np.nanmax(results.maps.pressure_Pa)) / MEGAPASCAL or 1.0
+    return float(np.nanmax(results.maps.peaks_Pa)) / MEGAPASCAL or 1.0
 
 
 def frame_maps(results: "Results", view: TopView) -> dict[str, Any]:
@@ -117,7 +117,8 @@ def _tiles(
     """
     maps = results.maps
     assert maps is not None
-    levels = pressure_levels(maps.pressure_Pa[rows], maps.gap_m[rows], view.triangles, largest)
+    pressure, gap = (maps.rows(name, rows) for name in ("pressure_Pa", "gap_m"))
+    levels = pressure_levels(pressure, gap, view.triangles, largest)
     result = view.grid.sample(levels, FRAME_MAP.coarsening)
     down, over = touched_part(result.max(axis=0) > 0)
     steps = np.clip(

@@ -7,12 +7,12 @@ escaped unless the template marks them as safe.
 import base64
 import hashlib
 import re
-from functools import lru_cache
 from importlib.resources import files
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
+
+from tkamb.run.texts import environment
 
 
 def asset(package: str, name: str) -> str:
@@ -28,21 +28,9 @@ def render(package: str, name: str, **values: Any) -> str:
         name: file name in the folder `assets` of the package.
         values: values of the names in the template. A missing value raises an error.
     """
-    return _environment(package).get_template(name).render(values)
-
-
-@lru_cache(maxsize=4)
-def _environment(package: str) -> Environment:
-    environment = Environment(
-        loader=PackageLoader(package, "assets"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["unbroken"] = _unbroken
-    environment.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
-    return environment
+    pages = environment(package, True)
+    pages.filters["unbroken"] = _unbroken
+    return pages.get_template(name).render(values)
 
 
 def _unbroken(text: str) -> Markup:

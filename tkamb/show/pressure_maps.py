@@ -180,7 +180,7 @@ def draw_maps(
     results: "Results", view: TopView, axis: HorizontalAxis, frames: Sequence[int]
 ) -> Figure:
     """Return a figure of pressure maps of some frames, on a scale from 0 to the run's largest."""
-    largest = float(np.nanmax(_pressure(results)))
+    largest = 0.0 if results.maps is None else float(np.nanmax(results.maps.peaks_Pa)) / MEGAPASCAL
     scale = Normalize(0.0, largest if largest > 0 else 1.0)
     across = min(4, len(frames))
     down = -(-len(frames) // across)
@@ -212,7 +212,8 @@ def draw_map(
     assert results.maps is not None
     row = map_rows(results)[frame]
     view.draw_insert(axes)
-    draw_pressure(axes, view, _pressure(results)[row], scale, results.maps.gap_m[row])
+    data = results.maps.frame_data(row)
+    draw_pressure(axes, view, data["pressure_Pa"] / MEGAPASCAL, scale, data["gap_m"])
     _draw_centres(axes, view, results, frame)
     view.draw_labels(axes)
 
@@ -273,12 +274,6 @@ def draw_paths(
             _label_stops(axes, x, y, axis, frames, colour)
         view.draw_labels(axes)
     return figure
-
-
-def _pressure(results: "Results") -> Array:
-    if results.maps is None:
-        raise ValueError("the run has no pressure maps")
-    return results.maps.pressure_Pa / MEGAPASCAL
 
 
 def _edge_length_mm(points: Array, triangles: NDArray[np.int64]) -> float:

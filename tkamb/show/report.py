@@ -1,7 +1,8 @@
 """The report of a run: one self-contained HTML page.
 
-A slider selects a frame and moves a cursor in every plot. The page holds the values of all frames
-as JSON, rounded to five digits. Without scripts, and on paper, the page has no cursor.
+A slider selects a frame and moves a cursor in every plot. The page holds the values of the frames
+as JSON, rounded to five digits; of a long recording it shows a few hundred frames. Without scripts,
+and on paper, the page has no cursor.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -13,7 +14,14 @@ import numpy as np
 from tkamb.files import write_text
 from tkamb.geometry.frames import Array
 from tkamb.run.metrics import body_weight, failed, flagged
-from tkamb.show.axis import LABELS, HorizontalAxis, horizontal_axis
+from tkamb.show.axis import (
+    EVENLY_SHOWN,
+    LABELS,
+    HorizontalAxis,
+    horizontal_axis,
+    results_at,
+    shown_frames,
+)
 from tkamb.show.frame_maps import draw_insert, frame_maps, largest_pressure
 from tkamb.show.headline import cards, run_title
 from tkamb.show.methods import methods
@@ -21,7 +29,14 @@ from tkamb.show.pages import asset, policy_sources, render
 from tkamb.show.panels import Panel, centre_panel, panels
 from tkamb.show.plots import WIDTH, Sheet
 from tkamb.show.pressure_maps import draw_maps, draw_paths, mapped_frames, top_view
-from tkamb.show.sections import conclusions, flag_rows, motion_table, strain_table, wear_section
+from tkamb.show.sections import (
+    conclusions,
+    flag_rows,
+    lead,
+    motion_table,
+    strain_table,
+    wear_section,
+)
 from tkamb.show.style import svg_text
 
 if TYPE_CHECKING:
@@ -67,11 +82,13 @@ def report_html(results: "Results", progress: Progress = lambda drawn: drawn) ->
         results: results of a run.
         progress: function that wraps the plots, for example a progress bar.
     """
-    axis = horizontal_axis(results)
+    axis, shown = horizontal_axis(results), shown_frames(results)
+    drawn = results_at(results, shown)
+    drawn_axis = horizontal_axis(drawn)
     style = asset(PACKAGE, "report.css")
     script = "\n".join(asset(PACKAGE, name) for name in SCRIPTS)
-    sheet = Sheet(results, axis)
-    maps, force = _maps(results, axis, sheet), results["force_total_N"]
+    sheet = Sheet(drawn, drawn_axis)
+    maps, force = _maps(drawn, drawn_axis, sheet), drawn["force_total_N"]
     return render(
         PACKAGE,
         "report.html",
@@ -80,13 +97,14 @@ def report_html(results: "Results", progress: Progress = lambda drawn: drawn) ->
         script=script,
         title=run_title(results.summary),
         subtitle=_subtitle(results),
+        lead=lead(results, axis),
         cards=cards(results, axis),
         conclusions=conclusions(results),
         sentences=_sentences(results.summary),
         maps=maps,
-        legend=_legend(results, axis),
-        plots=[_plot(panel, sheet) for panel in progress(panels(results))],
-        muscles=_muscles(results, axis),
+        legend=_legend(drawn, drawn_axis, len(results)),
+        plots=[_plot(panel, sheet) for panel in progress(panels(drawn))],
+        muscles=_muscles(drawn, drawn_axis),
         wear=wear_section(results),
         motion=motion_table(results, axis),
         strain=strain_table(results.summary),
@@ -94,9 +112,10 @@ def report_html(results: "Results", progress: Progress = lambda drawn: drawn) ->
         axis_name=LABELS[axis.kind].split(" (")[0],
         methods=methods(results.summary) if "scene_tables" in results.summary else None,
         provenance=_provenance(results.summary),
-        last_frame=len(results) - 1,
+        last_frame=len(drawn) - 1,
         first_frame=int(np.nanargmax(force)) if np.isfinite(force).any() else 0,
-        cursor=_cursor_data(results, axis) | {"maps": maps and maps["frames"]},
+        cursor=_cursor_data(drawn, drawn_axis)
+        | {"frames": shown.tolist(), "maps": maps and maps["frames"]},
     )
 
 
@@ -174,9 +193,16 @@ def _plot(panel: Panel, sheet: Sheet) -> dict[str, Any]:
     return {"panel": panel, "svg": svg_text(sheet.draw(panel), panel.name)}
 
 
-def _legend(results: "Results", axis: HorizontalAxis) -> list[str]:
-    """Return the meaning of the marks in the plots."""
+def _legend(results: "Results", axis: HorizontalAxis, computed: int) -> list[str]:
+    """Return the meaning of the marks in the plots of the shown frames."""
     sentences = [COLOURS]
+    if len(results) < computed:
+        sentences.append(
+            f"The plots, the maps and the slider show {len(results)} of the {computed} computed "
+            "frames: every "
+            f"{computed / EVENLY_SHOWN:.0f}th, and those of the largest value of each quantity. "
+            "All numbers and tables are of all frames; results.csv and contact.h5 hold them."
+        )
     if results.bands:
         sentences.append(
             "Shaded: 5 to 95 % of the samples with varied inputs. Dotted: median of the samples. "
@@ -200,14 +226,11 @@ def _legend(results: "Results", axis: HorizontalAxis) -> list[str]:
 
 
 def _sentences(summary: dict[str, Any]) -> list[str]:
-    """Return residuals, notes, assumptions, discrepancy and parts not modelled, each once."""
+    """Return residuals, notes, assumptions and parts not modelled, each once."""
     result: list[str] = []
     for key in ("residuals", "notes", "assumptions"):
         value = summary.get(key) or []
         result.extend([value] if isinstance(value, str) else [str(item) for item in value])
-    words = (summary.get("discrepancy") or {}).get("words")
-    if words and not summary.get("measured"):
-        result.append(str(words))
     missing = summary.get("not_modelled")
     if missing:
         result.append("Not modelled: " + ", ".join(map(str, missing)) + ".")

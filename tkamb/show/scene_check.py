@@ -282,6 +282,7 @@ class SceneCheck:
             *(entry.line() for entry in self.entries),
             f"not modelled: {', '.join(self.not_modelled)}",
             *(f"assumed: {sentence}" for sentence in self.assumptions),
+            *(f"notice: {remark}" for remark in self.case.remarks),
             *([f"question: {question}" for question in self.questions] or nothing),
             *self.answered,
         ]
@@ -299,6 +300,7 @@ class SceneCheck:
             ],
             "not_modelled": list(self.not_modelled),
             "assumptions": list(self.assumptions),
+            "notices": list(self.case.remarks),
             "questions": list(self.questions),
             "answered": list(self.answered),
             "missing": list(self.missing),

@@ -11,8 +11,9 @@ import numpy as np
 
 from tkamb.errors import InputError
 from tkamb.files import MEGABYTE, read_bytes, read_json
-from tkamb.geometry.frames import Array, Mask
-from tkamb.run import metrics
+from tkamb.geometry.frames import Array
+from tkamb.run import metrics, texts
+from tkamb.run.claims import compared_forces, method_error, peaks_of, split_of
 from tkamb.run.known_errors import is_large, known_error_words
 from tkamb.run.metrics import (
     body_weight,
@@ -20,126 +21,58 @@ from tkamb.run.metrics import (
     residual_share,
     tension_ratio,
 )
-from tkamb.run.status import AGREEMENT
 from tkamb.show.axis import HorizontalAxis
 from tkamb.show.headline import OTHER_ERRORS, PRESSURE_AND_AREA
 
 if TYPE_CHECKING:
     from tkamb.run.results import Results
 
-ALWAYS_NOT = (
-    "What happens in another patient, trial or day: this run describes one knee in one motion."
-)
-
 
 def conclusions(results: "Results") -> tuple[list[str], list[str]]:
     """Return the conclusions that a run supports, and those that it does not support."""
-    sentences = (
-        _conclude_force(results),
-        _conclude_split(results),
-        _conclude_pressure(results),
-        _conclude_certainty(results),
+    summary = results.summary
+    compared, error = compared_forces(summary), summary.get("known_error")
+    words = texts.lines(
+        "tkamb.show",
+        "conclusions.txt",
+        questions=summary.get("questions") or [],
+        modelled=bool(np.isfinite(results["force_total_N"]).any()),
+        compared=compared,
+        compared_split=bool(compared.keys() & {"medial", "lateral"}),
+        error=method_error(summary),
+        frames=len(results),
+        failed=int(metrics.failed(results).sum()),
+        split=split_of(results.columns),
+        known_error=error,
+        large=error is not None and is_large(error, PRESSURE_AND_AREA),
+        error_words="" if error is None else _known_error(error),
+        foundation=(summary.get("contact") or {}).get("model", "").startswith("foundation"),
+        varied=bool(summary.get("uncertainty")),
     )
-    supported = [words for good, _ in sentences for words in good]
-    unsupported = [words for _, bad in sentences for words in bad]
-    questions = len(results.summary.get("questions") or [])
-    if questions:
-        many = "questions above are" if questions > 1 else "question above is"
-        unsupported.insert(0, f"Any conclusion, before the {many} answered.")
-    return supported, [*unsupported, ALWAYS_NOT]
+    return tuple([one[2:] for one in words if one[0] == sign] for sign in "+-")  # type: ignore[return-value]
 
 
-def _conclude_force(results: "Results") -> tuple[list[str], list[str]]:
-    if not np.isfinite(results["force_total_N"]).any():
-        return [], ["The contact force: it is not modelled here, or every frame failed."]
-    failures = metrics.failed(results)
-    bad = [f"Results in {_frame_count(failures)}, which failed."] if failures.any() else []
-    measured = _compared(results)
-    if measured:
-        parts = [f"{name} {one['rmse_BW']:.2f} BW" for name, one in measured.items()]
-        worse = [name for name, one in measured.items() if (one["r_squared"] or 0.0) < 0.0]
-        bad += [
-            f"The course of the {name} force: the mean of the measurement fits better than the "
-            "prediction."
-            for name in worse
-        ]
-        return [
-            f"The forces of this trial, with an error of {', '.join(parts)} (rms) against the "
-            f"measurement."
-        ], bad
-    if results.summary.get("muscle_groups"):
-        bad.append(
-            "The true sharing of the load between muscles: no measurement was given for comparison."
-        )
-        return [
-            "The total force, if the muscles share the joint moments as the scene assumes."
-        ], bad
-    bad.append("The effect of hamstrings and gastrocnemius: the quadriceps is the only muscle.")
-    return [
-        "A lower bound of the contact force in the real knee: in the model only the quadriceps "
-        "acts, and co-contraction of other muscles would raise the force."
-    ], bad
+def _known_error(error: Mapping[str, Any] | str) -> str:
+    return f"{known_error_words(error, PRESSURE_AND_AREA)} {OTHER_ERRORS}"
 
 
-def _compared(results: "Results") -> dict[str, Any]:
-    """Return name of a measured force -> its comparison, if any frame was compared."""
-    result = results.summary.get("measured") or {}
-    return {name: one for name, one in result.items() if one["frames_compared"]}
-
-
-def _conclude_split(results: "Results") -> tuple[list[str], list[str]]:
-    if _compared(results).keys() & {"medial", "lateral"}:
-        return [], []
-    if not np.isfinite(metrics.medial_share(results, "equilibrium")).any():
-        return [], []
-    unknown = metrics.split_undetermined(results)
-    apart = (metrics.shares_apart(results) > AGREEMENT.share_difference) & ~unknown
-    bad = []
-    if unknown.any():
-        bad = [
-            f"The split by deformation in {_frame_count(unknown)}: half a degree of adduction "
-            "changes it strongly."
-        ]
-    if apart.any():
-        bad.append(
-            f"The split in {_frame_count(apart)}: the estimates by equilibrium and by deformation "
-            "differ."
-        )
-    if apart.all():
-        return [], bad
-    how = ", by equilibrium of moments" if unknown.any() else ", as far as the knee's pose is right"
-    where = " in the other frames" if apart.any() else ""
-    return [f"The share of each condyle{where}{how}."], bad
-
-
-def _conclude_pressure(results: "Results") -> tuple[list[str], list[str]]:
-    error = results.summary.get("known_error")
-    if error is None:
-        return [], ["Pressures and areas: contact is not modelled."]
-    supported = [
-        "Whether the pressure rises or falls with another design, pose or setting that is computed "
-        "in the same way."
-    ]
-    if isinstance(error, str):
-        return supported, [f"Pressures and areas as absolute values: their error is {error}."]
-    words = f"{known_error_words(error, PRESSURE_AND_AREA)} {OTHER_ERRORS}"
-    if is_large(error, PRESSURE_AND_AREA):
-        return supported, [f"Pressures and areas as absolute values. {words}"]
-    return [f"Pressures and areas of unworn surfaces. {words}", *supported], []
-
-
-def _conclude_certainty(results: "Results") -> tuple[list[str], list[str]]:
-    if results.summary.get("uncertainty"):
-        return ["The effect of the varied inputs: see the shaded bands."], []
-    return [], ["The uncertainty of these results: no input was varied. Use `tkamb uncertainty`."]
-
-
-def _frame_count(chosen: Mask) -> str:
-    """Return in words how many frames of a mask (f,) are True."""
-    count = int(chosen.sum())
-    if count == len(chosen):
-        return "any frame" if count > 1 else "the frame"
-    return f"{count} of {len(chosen)} frames"
+def lead(results: "Results", axis: HorizontalAxis) -> list[tuple[str, str]]:
+    """Return the three first lines of the report: peak forces, their error, limits of use."""
+    split = split_of(results.columns)
+    unsupported = conclusions(results)[1]
+    words = texts.lines(
+        "tkamb.show",
+        "lead.txt",
+        peaks=peaks_of(results),
+        split=split,
+        weight=body_weight(results),
+        error=method_error(results.summary),
+        compared=compared_forces(results.summary),
+        at=axis.at,
+        kind=axis.kind,
+        wrong=[one[:1].lower() + re.split(r"[:.]", one[1:])[0] for one in unsupported],
+    )
+    return [(head, text) for head, _, text in (line.partition(" | ") for line in words)]
 
 
 Entry = tuple[str, str, Array, int]
@@ -234,13 +167,19 @@ def _runs(frames: Sequence[int]) -> list[tuple[int, int]]:
 
 
 def _stretches(frames: Sequence[int]) -> str:
-    return ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in _runs(frames))
+    return _listed([str(a) if a == b else f"{a}–{b}" for a, b in _runs(frames)])
 
 
 def _positions(frames: Sequence[int], axis: HorizontalAxis) -> str:
-    return ", ".join(
-        axis.at(a) if a == b else f"{axis.at(a)} to {axis.at(b)}" for a, b in _runs(frames)
+    return _listed(
+        [axis.at(a) if a == b else f"{axis.at(a)} to {axis.at(b)}" for a, b in _runs(frames)]
     )
+
+
+def _listed(stretches: list[str]) -> str:
+    """Return the stretches as text; of many, the first and their number."""
+    more = len(stretches) - STRETCHES_SHOWN
+    return ", ".join(stretches[:STRETCHES_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
 def _entries(results: "Results", axis: HorizontalAxis) -> list[Entry]:
@@ -276,6 +215,8 @@ def _number(value: float, digits: int) -> str:
     return text.removeprefix("-") if float(text) == 0 else text.replace("-", "−")
 
 
+STRETCHES_SHOWN = 60
+"""1: stretches of frames that a table lists. Not studied."""
 WEAR_NAME, PICTURE_NAME, WORN_NAME = "wear.json", "wear.png", "wear.vtp"
 
 

@@ -110,17 +110,13 @@ def run_body_trade(rows: KeptRows | None = None) -> Iterator[BodyRow]:
     base: _Run | None = None
     for name, change in CHANGES.items():
         key = row_key("body", name, asdict(change))
-        row = rows.read(key, BodyRow, _is_whole) if rows else None
+        row = rows.read(key, BodyRow) if rows else None
         if row is None:
             base = base or _run(CHANGES["as shipped"])
             row = _row(name, change, base)
             if rows:
                 rows.put(key, asdict(row))
         yield row
-
-
-def _is_whole(row: BodyRow) -> bool:
-    return row.name in CHANGES and (row.changed is None or row.changed.keys() == HEADS.keys())
 
 
 @dataclass(frozen=True, eq=False)

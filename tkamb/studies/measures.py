@@ -8,9 +8,7 @@ and a crash or a hang is recorded. The process uses one thread for repeatable ti
 """
 
 import json
-import math
 import os
-import re
 import subprocess
 import sys
 import time as clock
@@ -50,18 +48,6 @@ def quantities(result: ContactResult) -> Quantities:
         for part in PARTS:
             values[f"{side}_{part}"] = 0.0 if condyle is None else float(getattr(condyle, part))
     return values
-
-
-def are_quantities(values: Mapping[str, float]) -> bool:
-    """Return whether values have exactly the names of `quantities` and are finite."""
-    names = {"approach", *(f"{side}_{part}" for side in SIDES for part in PARTS)}
-    return values.keys() == names and all(map(math.isfinite, values.values()))
-
-
-def is_map(stored: Mapping[str, float]) -> bool:
-    """Return whether a stored raster has keys "i j" and finite pressures."""
-    places = all(re.fullmatch(r"-?\d{1,6} -?\d{1,6}", place) for place in stored)
-    return places and all(map(math.isfinite, stored.values()))
 
 
 def errors(values: Mapping[str, float], reference: Mapping[str, float]) -> dict[str, float]:
@@ -213,19 +199,6 @@ class Measure:
     nodes: int = 0
     values: Quantities = field(default_factory=dict)
     map: dict[str, float] = field(default_factory=dict)
-
-
-MOST_NODES = 10**9
-"""Upper limit of the nodes and iterations in a valid stored measure."""
-
-
-def is_whole(measure: Measure) -> bool:
-    """Return whether a stored measure has the values that its status requires."""
-    if max(measure.iterations, measure.nodes) > MOST_NODES:
-        return False
-    if measure.status != "ok":
-        return not measure.values and not measure.map
-    return are_quantities(measure.values) and is_map(measure.map)
 
 
 def measure_apart(job: Job, longest: float = MEASURE.longest_seconds) -> Measure:

@@ -38,8 +38,6 @@ from tkamb.studies.cases import Sphere, StudyCase
 from tkamb.studies.measures import (
     Quantities,
     Raster,
-    are_quantities,
-    is_map,
     quantities,
     raster_map,
     raster_of,
@@ -276,14 +274,6 @@ def _by_layer(case: StudyCase, sphere: Sphere) -> tuple[Quantities, Quantities]:
     }
     values |= {name.replace("medial", "lateral"): 0.0 for name in list(values) if "medial" in name}
     return values, {name: REFERENCE.width_effect * value for name, value in values.items()}
-
-
-def is_reference(reference: Reference, case: StudyCase) -> bool:
-    """Return whether a stored reference belongs to a case and is complete."""
-    values = (reference.values, reference.uncertainty, *reference.solved.values())
-    return (
-        reference.hash == case.hash and all(map(are_quantities, values)) and is_map(reference.map)
-    )
 
 
 def read_references(path: Path = STORED) -> dict[str, Reference]:

@@ -110,11 +110,7 @@ def kept_verdicts(
 
 
 def _kept_verdict(kept: KeptRows, case: Case, longest: float) -> Verdict | None:
-    return kept.read(
-        _row_key(case, longest),
-        Verdict,
-        lambda row: row.kind in KINDS and row.case == case.label,
-    )
+    return kept.read(_row_key(case, longest), Verdict)
 
 
 def _row_key(case: Case, longest: float) -> str:

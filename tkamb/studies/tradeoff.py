@@ -26,7 +26,6 @@ from tkamb.studies.measures import (
     Job,
     Measure,
     errors,
-    is_whole,
     map_error,
     measure_apart,
     raster_of,
@@ -35,7 +34,6 @@ from tkamb.studies.references import (
     STORED,
     Reference,
     compute_reference,
-    is_reference,
     read_references,
     reference_of,
     write_references,
@@ -283,7 +281,7 @@ def run_tradeoff(
 
 
 def _measured(rows: KeptRows | None, key: str, measure: Callable[[], Measure]) -> Measure:
-    result = rows.read(key, Measure, is_whole) if rows else None
+    result = rows.read(key, Measure) if rows else None
     if result is None:
         result = measure()
         if rows:
@@ -355,7 +353,7 @@ def _user_reference(
     case: StudyCase, announce: Callable[[str], None], rows: KeptRows | None
 ) -> Reference:
     key = row_key("reference", case.hash)
-    stored = rows.read(key, Reference, lambda row: is_reference(row, case)) if rows else None
+    stored = rows.read(key, Reference) if rows else None
     if stored is not None:
         return stored
     announce(f"reference of case '{case.name}': {case.label}")

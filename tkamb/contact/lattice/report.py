@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.contact.area import covered_areas
-from tkamb.contact.flags import narrow_flags
+from tkamb.contact.flags import MESH_DEFECT, narrow_flags
 from tkamb.contact.lattice.problem import (
     LEAST_NORMAL_Y,
     LatticeState,
@@ -70,8 +70,12 @@ def unresolved_flags(state: LatticeState, result: ContactResult) -> tuple[str, .
         if pressure.max(initial=0.0) > 0.0
     }
     femoral, spacing = state.problem.femoral, state.lattice.spacing
+    narrow = narrow_flags(state.surface.triangles, result.pressure > 0, sides)
+    # Finer cells do not help against a rough surface; an opening says nothing about their size.
+    if any(MESH_DEFECT in flag and "opening" not in flag for flag in result.flags):
+        narrow = iter(())
     return (
-        *narrow_flags(state.surface.triangles, result.pressure > 0, sides),
+        *narrow,
         *edge_flags(femoral, result.pose, spacing, peaks),
     )
 

@@ -7,7 +7,6 @@ SHA-256 before it is written. Repeating an interrupted download loads only the m
 import json
 import shutil
 import tempfile
-import time as clock
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -30,14 +29,12 @@ class DataFile:
         sha256: SHA-256 of the content, hexadecimal.
         commit: commit of the repository; None: no published address is known.
         path: path in the repository; None: no published address is known.
-        size: published size, bytes; None: unknown.
     """
 
     name: str
     sha256: str
     commit: str | None = None
     path: str | None = None
-    size: int | None = None
 
     def url(self, base: str) -> str | None:
         """Return the file's address below `base`, the address of all raw files, or None."""
@@ -79,9 +76,7 @@ def read_dataset(name: str) -> Dataset:
         content["url"],
         Path(content["folder"]),
         tuple(
-            DataFile(
-                file, entry["sha256"], entry.get("commit"), entry.get("path"), entry.get("bytes")
-            )
+            DataFile(file, entry["sha256"], entry.get("commit"), entry.get("path"))
             for file, entry in content["files"].items()
         ),
     )
@@ -89,12 +84,6 @@ def read_dataset(name: str) -> Dataset:
 
 TIMEOUT_S = 30
 """s: a download fails if the server sends nothing for this time."""
-LONGEST_S = 1800.0
-"""s: longest download time of one file; enough for 500 MB at 0.3 MB/s."""
-LARGEST = 1_000_000_000
-"""bytes: largest accepted size of a file with unknown published size."""
-CHUNK = 65_536
-"""bytes: amount of a download that is written at a time."""
 
 
 @dataclass
@@ -203,7 +192,7 @@ def _retrieved(address: str, file: DataFile, folder: Path) -> Path:
     import pooch
     from requests.exceptions import HTTPError, RequestException
 
-    fetch = _LimitedDownload(LARGEST if file.size is None else file.size)
+    fetch = pooch.HTTPDownloader(timeout=TIMEOUT_S)
     digest = f"sha256:{file.sha256}"
     hint = "run it again: complete files are kept; or give --from DIR with files you downloaded"
     try:
@@ -220,37 +209,6 @@ def _retrieved(address: str, file: DataFile, folder: Path) -> Path:
         if "hash" not in str(error):
             raise InputError(f"cannot be downloaded ({error})", address, hint) from None
         raise _other_content(address, file) from None
-
-
-@dataclass(frozen=True)
-class _LimitedDownload:
-    """Downloader for pooch that stops at `size` bytes and after `LONGEST_S`."""
-
-    size: int
-
-    def __call__(self, url: str, output_file: str, pooch: object) -> None:
-        """Download an address into a file.
-
-        Raises:
-            InputError: the download is larger than `size`, or takes too long.
-        """
-        import requests
-
-        end, received = clock.monotonic() + LONGEST_S, 0
-        with (
-            requests.get(url, stream=True, timeout=TIMEOUT_S) as answer,
-            open(output_file, "wb") as file,
-        ):
-            answer.raise_for_status()
-            for chunk in answer.iter_content(CHUNK):
-                received += len(chunk)
-                if received > self.size:
-                    what = f"gives more than the {self.size} bytes that are registered"
-                    raise InputError(what, url, "it may be another version; the file was not kept")
-                if clock.monotonic() > end:
-                    what = f"is not complete after {LONGEST_S / 60:.0f} minutes"
-                    raise InputError(what, url, "run it again: complete files are kept")
-                file.write(chunk)
 
 
 def _verified_copy(file: DataFile, folder: Path) -> Path | None:

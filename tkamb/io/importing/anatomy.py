@@ -8,7 +8,7 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, inverse, transform
 from tkamb.io.opensim.kinematics import Kinematics
-from tkamb.io.opensim.model import Coordinate, Joint, OpenSimModel
+from tkamb.io.opensim.model import GROUND, Coordinate, Joint, OpenSimModel
 
 OTHER = {"right": "left", "left": "right"}
 SEGMENT_LENGTH = (0.15, 0.75)
@@ -135,6 +135,14 @@ def _joints(
     """Return the joints knee, hip and ankle, and the bodies of femur and tibia."""
     knee = _knee(model, side, name)
     groups = _rigid_groups(model)
+    for body in (knee.inboard, knee.outboard):
+        if GROUND in groups[body]:
+            raise InputError(
+                f"has '{body}' of the knee '{knee.name}' welded to ground, so that it cannot move "
+                "in the laboratory",
+                model.name,
+                "give hip and ankle their joints, or another joint with --knee",
+            )
     femur = _ordered(model, groups[knee.inboard], "fem")
     tibia = _ordered(model, groups[knee.outboard], "tib")
     hip = _single_joint(
@@ -241,7 +249,7 @@ def _moving(model: OpenSimModel) -> list[Joint]:
 
 def _rigid_groups(model: OpenSimModel) -> dict[str, set[str]]:
     """Return body -> set of the bodies that are welded to it, and the body itself."""
-    groups = {body: {body} for body in ("ground", *model.bodies)}
+    groups = {body: {body} for body in (GROUND, *model.bodies)}
     moving = _moving(model)
     for joint in model.joints:
         if joint not in moving:

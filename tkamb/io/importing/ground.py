@@ -8,11 +8,15 @@ import numpy as np
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
+from tkamb.io.importing.anatomy import Leg
+from tkamb.io.importing.clocks import check_clocks
+from tkamb.io.importing.external_loads import with_external_loads
 from tkamb.io.importing.plates import (
     Feet,
     Load,
     RecordedForce,
     TableForce,
+    check_upward,
     common_surface,
     feet_loads,
     known_interval,
@@ -67,18 +71,19 @@ class FoundGround:
     remarks: list[str]
 
 
-def find_ground(request: ImportRequest, side: str, axes: str, feet: Feet | None) -> FoundGround:
+def find_ground(request: ImportRequest, leg: Leg, axes: str, feet: Feet | None) -> FoundGround:
     """Return the ground reaction of one foot.
 
     Args:
         request: the recording, table, plates and interval.
-        side: "left" or "right".
+        leg: the leg of the foot.
         axes: axes of the recording and table that point forward, up and right.
         feet: positions of the feet; None: unknown.
 
     Raises:
         InputError: the plates or columns cannot be used, or both feet loaded one plate.
     """
+    request, side = with_external_loads(request, leg.foot), leg.side
     if request.grf is not None:
         return _from_table(request, request.grf, side, axes, feet)
     if request.recording.suffix.lower() == ".c3d" and feet is not None:
@@ -107,10 +112,11 @@ def _from_plates(request: ImportRequest, side: str, axes: str, feet: Feet) -> Fo
             "give the ground reaction with --grf, or --plates none to model none",
         )
     forces = plate_forces(recording, axes)
+    downward = check_upward(forces, feet, side)
     loads = feet_loads(forces, feet)
     plates = own_plates(loads, side, request.recording)
     interval = request.interval or known_interval(loads, plates, feet)
-    lines = [*(_load_line(load) for load in loads), _interval_line(request, interval)]
+    lines = [*(_load_line(load) for load in loads), *downward, _interval_line(request, interval)]
     lines += _unmeasured_line(loads, plates, feet, side, interval)
     lines += _drift_lines(forces, plates)
     surface = common_surface(loads, plates)
@@ -131,7 +137,7 @@ def _from_table(
     forces = table_forces(table)
     time = table.time()
     span = (float(time[0]), float(time[-1]))
-    notices = [f"notice: {path.name}: {notice}" for notice in table.notices]
+    notices = [f"notice: {remark}" for remark in table.remarks]
     table_axes = _axes_of_table(table, forces, axes)
     if table_axes != axes:
         notices.append(f"{path.name}: y points up; forward, up, right are its {table_axes}")
@@ -139,21 +145,27 @@ def _from_table(
     if request.plates is not None:
         raise InputError("is for the plates of a .c3d", "--plates", "give --grf-force for a table")
     chosen = _named(forces, side, request.grf_force, table)
+    has_places = all(force.has("point") or force.has("moment") for force in forces)
     if chosen:
+        if feet is not None and has_places:
+            check_clocks([_recorded(table, force, axes) for force in chosen], feet, side, path)
         why = "as given" if request.grf_force else "by their name"
         recorded = [_recorded(table, force, axes) for force in chosen] if len(chosen) > 1 else []
         ground = _table_file(path, axes, chosen, recorded)
         lines = [_columns_line(path, side, chosen, why), *notices]
         return FoundGround(ground, request.interval, span, lines)
-    has_places = all(force.has("point") or force.has("moment") for force in forces)
     if feet is None or not forces or not has_places:
         raise _which_foot(forces, side, table)
     recorded = [_recorded(table, force, axes) for force in forces]
     loads = feet_loads(recorded, feet)
+    if not any(load.side == side for load in loads):
+        for one in recorded:
+            check_clocks([one], feet, side, path)
     names = own_plates(loads, side, path, "give --grf-force")
     interval = request.interval or known_interval(loads, names, feet)
     chosen = [force for force in forces if force.name in names]
     foot_forces = [force for force in recorded if force.key in names]
+    check_clocks(foot_forces, feet, side, path)
     lines = [*(_load_line(load) for load in loads), _interval_line(request, interval)]
     lines += [_columns_line(path, side, chosen, "by their points of application"), *notices]
     lines += [*_unmeasured_line(loads, names, feet, side, interval), *_drift_lines(recorded, names)]

@@ -1,14 +1,15 @@
 """Markers of the leg that model and recording share, and the laboratory axes they imply."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from tkamb.errors import InputError
-from tkamb.geometry.frames import Array, transform
+from tkamb.geometry.frames import Array, inverse, transform
 from tkamb.io.importing.anatomy import Leg, find_leg
 from tkamb.io.importing.links import Links
+from tkamb.io.opensim.model import OpenSimModel
 from tkamb.io.recordings.markers import fit_seen, marker_trajectories, matched_labels, plain_label
 from tkamb.io.recordings.tables import Table
 from tkamb.units import DEGREE
@@ -85,20 +86,14 @@ def seen_segments(
         InputError: the recording has no marker with a label from `without`.
     """
     leg = links.leg
-    foot = _with_most_markers(leg, leg.foot)
-    body, ankle = leg.ankle_centre
-    in_foot = transform(leg.in_body(body, foot), ankle)
-    hip_body, hip = leg.hip_centre
-    in_pelvis = transform(leg.in_body(hip_body, leg.pelvis), hip)
-    definitions = [
-        ("shank", leg.tibia, "", None, None),
-        ("thigh", leg.femur, "", None, None),
-        ("foot", (foot,), "shank", np.zeros(3), in_foot),
-        ("pelvis", (leg.pelvis,), "thigh", links.hip, in_pelvis),
-    ]
+    joints = {"foot": (np.zeros(3), leg.ankle_centre), "pelvis": (links.hip, leg.hip_centre)}
     labels, dropped = _seen_labels(recorded, without)
     result = {}
-    for name, bodies, joined_to, joint, centre in definitions:
+    for name, bodies, joined_to in _bodies(leg):
+        joint = centre = None
+        if joined_to:
+            joint, (body, own_centre) = joints[name]
+            centre = transform(leg.in_body(body, bodies[0]), own_centre)
         body_markers = {m.name: m for m in leg.model.markers.values() if m.body in bodies}
         match = matched_labels(body_markers, labels)
         points = {
@@ -112,6 +107,37 @@ def seen_segments(
         missing = tuple(m for m in body_markers if m not in match and m not in left_out)
         result[name] = ModelSegment(name, points, missing, joined_to, joint, centre)
     return result
+
+
+def placed_markers(links: Links, points: Mapping[str, Mapping[str, Array]]) -> OpenSimModel:
+    """Return the leg's model with its markers at given positions.
+
+    Args:
+        links: the links of the leg.
+        points: "shank", "thigh", "foot" or "pelvis" -> label -> position of the marker, m, shape
+            (3,), as in `ModelSegment`. Labels match the model's markers as in `matched_labels`.
+            Other segments and markers keep the model's positions.
+    """
+    leg, placed = links.leg, dict(links.leg.model.markers)
+    for name, bodies, joined_to in _bodies(leg):
+        own = {m.name: m for m in placed.values() if m.body in bodies}
+        given = dict(points.get(name, {}))
+        for marker, label in matched_labels(own, given).items():
+            place, body = given[label], own[marker].body
+            if not joined_to:
+                place = transform(inverse(links.body_in_link(body)[1]), place)
+            placed[marker] = replace(own[marker], location=place)
+    return replace(leg.model, markers=placed)
+
+
+def _bodies(leg: Leg) -> tuple[tuple[str, tuple[str, ...], str], ...]:
+    """Return name, bodies and neighbour of each segment."""
+    return (
+        ("shank", leg.tibia, ""),
+        ("thigh", leg.femur, ""),
+        ("foot", (_with_most_markers(leg, leg.foot),), "shank"),
+        ("pelvis", (leg.pelvis,), "thigh"),
+    )
 
 
 def _seen_labels(recorded: Table, without: Sequence[str]) -> tuple[list[str], list[str]]:

@@ -18,6 +18,7 @@ from tkamb.io.importing.links import Links
 from tkamb.io.importing.plates import Feet
 from tkamb.io.opensim.kinematics import Kinematics
 from tkamb.io.opensim.motion import angle_lines, read_coordinates
+from tkamb.io.recordings.samples import check_spacing
 from tkamb.io.recordings.tables import Table
 from tkamb.units import DEGREE, MILLIMETRE
 
@@ -83,6 +84,7 @@ def model_motion(links: Links, recorded: Table) -> ModelMotion:
     leg = links.leg
     kinematics = Kinematics(leg.model)
     time = recorded.time()
+    check_spacing(recorded.path, time)
     q, missing = read_coordinates(kinematics, recorded)
     if leg.flexion is None or leg.flexion in missing:
         raise InputError(f"has no column '{leg.flexion}' for the knee's flexion", recorded.path)

@@ -13,9 +13,11 @@ from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.surface import Surface
 from tkamb.io.importing.anatomy import Leg, find_leg
 from tkamb.io.importing.links import Links, find_links, patient_urdf
-from tkamb.io.importing.markers import recorded_labels, with_prefix
+from tkamb.io.importing.marked_trials import with_registered_markers
+from tkamb.io.importing.markers import ModelSegment, recorded_labels, with_prefix
 from tkamb.io.importing.model_motion import MOTION_FILE
 from tkamb.io.importing.recorded_poses import read_poses
+from tkamb.io.importing.registration import Registration
 from tkamb.io.importing.request import ImportRequest
 from tkamb.io.importing.scene_text import GROUND_FILE, SceneText
 from tkamb.io.importing.soft_tissue import soft_tissue, some_names
@@ -70,6 +72,9 @@ class ImportedPatient:
         motion: text of motion.csv; None: the scene reads the recorded motion.
         report: lines on the files read and the assumptions made.
         ground: text of ground_reaction.csv; None: the scene reads the recorded forces, if any.
+        registration: registered markers; None: their positions are the model's or of a standing
+            trial.
+        model_segments: segments with the positions before the registration; () without one.
     """
 
     urdf: str
@@ -77,6 +82,8 @@ class ImportedPatient:
     motion: str | None
     report: tuple[str, ...]
     ground: str | None = None
+    registration: Registration | None = None
+    model_segments: tuple[ModelSegment, ...] = ()
 
 
 def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
@@ -148,11 +155,27 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
         unit = request.units.length
         scene, lines = with_static_markers(scene, request.static, segments, unit)
         report += lines
+    registration: Registration | None = None
+    before: tuple[ModelSegment, ...] = ()
+    if scene.markers is not None:
+        before = scene.markers.segments
+        scene, registration, lines = with_registered_markers(scene, request, links)
+        report += lines
+    elif request.register or request.companions:
+        raise InputError(
+            "is for a knee whose motion comes from markers", "--register", "leave it out"
+        )
     comment = f"Made by tkamb import from {request.model.name}, {request.side} leg (m, kg)"
     motion = result.motion.text() if result.motion else None
     ground = result.ground.made if result.ground else None
     return ImportedPatient(
-        patient_urdf(links, scale, comment), scene, motion, tuple(report), ground
+        patient_urdf(links, scale, comment),
+        scene,
+        motion,
+        tuple(report),
+        ground,
+        registration,
+        before,
     )
 
 
@@ -415,9 +438,8 @@ def _notes(
     request: ImportRequest, scale: float, trial: Trial, own_ligaments: bool
 ) -> tuple[str, ...]:
     quadriceps_note = (
-        "Without [muscles] only the quadriceps acts. When hamstrings and gastrocnemius act too, "
-        "the contact force is too low, and the quadriceps force is the least that the joint moment "
-        "needs."
+        "Without [muscles] only the quadriceps acts: the forces of hamstrings and gastrocnemius "
+        "are missing, and the quadriceps force is the least that the joint moment needs."
     )
     notes = [
         *(() if request.muscles else (quadriceps_note,)),

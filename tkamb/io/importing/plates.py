@@ -8,7 +8,7 @@ whose name fits no force is an error, unless every force of the table has a mome
 """
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -227,6 +227,19 @@ class RecordedForce:
         """(k,) whether the surface is loaded."""
         return np.asarray(self.wrench[:, 1] - self.drift > FOOT_CONTACT.min_force)
 
+    @property
+    def pushes_down(self) -> bool:
+        """Whether the vertical force points down while the surface is loaded."""
+        down = self.wrench[:, 1] < -FOOT_CONTACT.min_force
+        step = float(np.median(np.diff(self.time))) if len(self.time) > 1 else 0.0
+        long_enough = down.sum() * step >= FOOT_CONTACT.min_duration
+        return bool(long_enough and down.sum() > self.loaded.sum())
+
+    @property
+    def turned(self) -> "RecordedForce":
+        """The force with the opposite sign."""
+        return replace(self, wrench=-self.wrench, drift=-self.drift)
+
 
 @dataclass(frozen=True)
 class Load:
@@ -371,6 +384,28 @@ def own_plates(
             hint = f"check --laboratory-axes and the foot's labels, or {hint}"
         raise InputError(what, path, f"{hint}, or take another trial")
     return tuple(sorted(foot_plates, key=str))
+
+
+def check_upward(forces: list[RecordedForce], feet: Feet, side: str) -> list[str]:
+    """Return a line on each plate whose force points down under the other foot.
+
+    Raises:
+        InputError: the force of a plate under this foot, or under no known foot, points down.
+    """
+    lines = []
+    for force in forces:
+        if not force.pushes_down:
+            continue
+        largest = -float(np.nanmin(force.wrench[:, 1]))
+        what = f"{force.title}: the vertical force points down, with up to {largest:.0f} N"
+        if {load.side for load in feet_loads([force.turned], feet)} & {side, ""}:
+            raise InputError(
+                what,
+                feet.path,
+                "reverse the sign of its channels (ANALOG:SCALE), or take another trial",
+            )
+        lines.append(f"ATTENTION: {what}: not used")
+    return lines
 
 
 def common_surface(loads: list[Load], plates: tuple[int | str, ...]) -> float:

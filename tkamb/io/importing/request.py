@@ -25,6 +25,9 @@ class ImportRequest:
             the shank's pose.
         without: labels of markers to leave out.
         static: recording of a standing trial, which calibrates the markers' positions.
+        register: whether the markers' positions are found together with the motion; None: if they
+            misfit the model.
+        companions: recordings of the same subject and markers that take part in the registration.
         meshes: meshes of the implant.
         knee: name of the femorotibial joint.
         frames: part of the implant -> name of its mesh's frame in the model.
@@ -52,6 +55,8 @@ class ImportRequest:
     poses: PoseRecording | None = None
     without: tuple[str, ...] = ()
     static: Path | None = None
+    register: bool | None = None
+    companions: tuple[Path, ...] = ()
     meshes: Meshes | None = None
     knee: str | None = None
     frames: dict[str, str | None] = field(default_factory=dict)

@@ -120,6 +120,7 @@ class SceneText:
         coordinates: file of the model's coordinates; None: they are fitted to the markers.
         cycle: times of 0 and 100 % of the gait cycle, s; "plates": from foot strikes on the
             plates; None: results are shown over time.
+        uncertainty: deviations that a registration of the markers gives, as in [uncertainty].
     """
 
     title: tuple[str, ...]
@@ -141,6 +142,7 @@ class SceneText:
     model: Path | None = None
     coordinates: Path | None = None
     cycle: tuple[float, float] | Literal["plates"] | None = None
+    uncertainty: dict[str, float] = field(default_factory=dict)
 
     def text(self) -> str:
         """Return the text of the scene file."""
@@ -156,6 +158,7 @@ class SceneText:
             self._all_muscles(),
             self._ligaments(),
             self._contact(),
+            self._uncertainty(),
             self._output(),
         ]
         return "\n\n".join("\n".join(lines) for lines in tables if lines) + "\n"
@@ -337,6 +340,12 @@ class SceneText:
             "# not recorded: the equilibrium of contact, ligaments and muscle line gives them",
             'released = ["adduction", "axial_rotation", "ap", "ml"]',
         ]
+
+    def _uncertainty(self) -> list[str]:
+        if not self.uncertainty:
+            return []
+        values = [f"{key} = {value:g}" for key, value in self.uncertainty.items()]
+        return ["# what the registration of the markers leaves open", "[uncertainty]", *values]
 
     def _output(self) -> list[str]:
         stride = self.poses is not None and self.poses.given.stride is not None

@@ -35,6 +35,7 @@ from tkamb.io.recordings.inverse_kinematics import LegChain
 from tkamb.io.recordings.marker_motion import both_fits, leg_segments, neutral_coordinates
 from tkamb.io.recordings.markers import matched_labels, plain_label
 from tkamb.io.recordings.recording_tables import MarkersTable
+from tkamb.io.recordings.samples import check_spacing
 from tkamb.io.recordings.tables import Table, read_table, with_unit
 from tkamb.io.scene import Scene
 
@@ -73,7 +74,7 @@ def with_static_markers(
         f"marker positions are from the standing trial {static.name}, at most "
         f"{farthest * 1e3:.1f} mm from the model's"
     )
-    notices = [f"notice: {static.name}: {notice}" for notice in recorded.notices]
+    notices = [f"notice: {remark}" for remark in recorded.remarks]
     return replace(scene, markers=markers), [line, *notices]
 
 
@@ -164,8 +165,9 @@ def from_markers(request: ImportRequest, leg: Leg, links: Links, recorded: Table
     segments = model_segments(links, recorded, request.without)
     facing = _facing(request, segments, recorded)
     foot_positions = marked_feet(recorded, facing.axes, feet(leg, recorded, OTHER[leg.side]))
-    result = find_ground(request, leg.side, facing.axes, foot_positions)
+    result = find_ground(request, leg, facing.axes, foot_positions)
     time = recorded.time()
+    check_spacing(recorded.path, time)
     if request.interval is not None:
         _check_within(time, *request.interval)
     interval, joined = common_interval(time, result.interval, result.span)
@@ -200,7 +202,7 @@ def from_poses(
     shank = shank_markers(links, segments, stance, request.recording, facing.axes)
     covered = replace(request, interval=(float(poses.time[0]), float(poses.time[-1])))
     foot_positions = marked_feet(recorded, facing.axes, feet(leg, recorded, OTHER[leg.side]))
-    result = find_ground(covered, leg.side, facing.axes, foot_positions)
+    result = find_ground(covered, leg, facing.axes, foot_positions)
     matched = [*_notices(request, recorded), *_segment_lines(segments.values(), request.without)]
     text = (
         *poses.remarks,
@@ -226,11 +228,22 @@ def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: T
     if motion.missing:
         text.append(f"not in the motion, so at their defaults: {', '.join(motion.missing)}")
     text += [*_notices(request, recorded), *motion.remarks]
+    leg.model.check_gravity()
     feet = model_feet(links, recorded) if request.grf is not None else None
-    result = find_ground(request, leg.side, "+x,+y,+z", feet)
+    axes = leg.model.ground_axes
+    if axes is None:
+        if request.grf is not None:
+            raise InputError(
+                "has gravity along none of its ground's axes, so forces in this ground cannot be "
+                "read",
+                request.model,
+                "turn ground so that gravity is along an axis, or leave out --grf",
+            )
+        axes = "+x,+y,+z"
+    result = find_ground(request, leg, axes, feet)
     text += result.remarks
     if result.ground is not None:
-        text.append("laboratory: the model's ground, x forward, y up")
+        text.append(f"laboratory: forward, up, right are {axes} of the model's ground")
     if request.interval is not None:
         _check_within(motion.time, *request.interval)
     interval, joined = common_interval(motion.time, result.interval, result.span)
@@ -241,10 +254,10 @@ def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: T
 
 def _notices(request: ImportRequest, recorded: Table) -> list[str]:
     """Return notes on parts of the recording that are ignored or read in another way."""
-    notices = recorded.notices
+    remarks = recorded.remarks
     if recorded.path.suffix.lower() == ".c3d":
-        notices = read_c3d(recorded.path, request.units).all_notices
-    return [f"notice: {recorded.path.name}: {notice}" for notice in notices]
+        remarks = read_c3d(recorded.path, request.units).remarks
+    return [f"notice: {remark}" for remark in remarks]
 
 
 def _facing(request: ImportRequest, segments: list[ModelSegment], recorded: Table) -> Facing:

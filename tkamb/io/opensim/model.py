@@ -10,6 +10,7 @@ Seth et al., PLoS Comput Biol 14:e1006223 (2018), doi:10.1371/journal.pcbi.10062
 from dataclasses import dataclass
 from typing import Literal
 
+from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.io.opensim.functions import Function
 
@@ -323,7 +324,8 @@ class OpenSimModel:
 
     Args:
         name: the model's name.
-        gravity: acceleration of gravity in ground, m/s², shape (3,).
+        gravity: acceleration of gravity in ground, m/s², shape (3,). It is along -y: the file's
+            ground is turned upright when the file is read.
         bodies: name -> body, without ground.
         joints: the joints, ordered from ground outwards.
         coordinates: name -> coordinate, in the file's order. Every vector q has this order.
@@ -338,6 +340,8 @@ class OpenSimModel:
         left_out: "class 'name'" of each element of the file that tkamb does not model.
         unread: elements that a partial reading could not read.
         notices: lines on how the file was read.
+        ground_axes: axes of the file's ground that point along this ground's x, y and z (forward,
+            up, right), like "+x,+z,-y"; None: gravity is along none of the file's axes.
     """
 
     name: str
@@ -355,8 +359,15 @@ class OpenSimModel:
     left_out: tuple[str, ...]
     unread: tuple[Unread, ...] = ()
     notices: tuple[str, ...] = ()
+    ground_axes: str | None = "+x,+y,+z"
 
     @property
     def mass_kg(self) -> float:
         """Mass of the whole model."""
         return sum(body.mass_kg for body in self.bodies.values())
+
+    def check_gravity(self) -> None:
+        """Raise an InputError if the model has no gravity, which says where up is."""
+        if not self.gravity.any():
+            what = "has no gravity, which says where up is"
+            raise InputError(what, self.name, "write <gravity>0 -9.80665 0</gravity> if y is up")

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
@@ -23,18 +24,23 @@ from tkamb.io.opensim.model import (
     ConstantDistance,
     Coordinate,
     CoordinateCoupler,
+    Joint,
     Marker,
     OpenSimModel,
     Unread,
 )
 from tkamb.io.opensim.read_joints import Frames, outwards, read_joints
 from tkamb.io.opensim.read_paths import read_forces, read_wrap_objects
+from tkamb.units import STANDARD_GRAVITY
 
 UNITS = {
     "length_units": ("meters", "meter", "metres", "metre", "m"),
     "force_units": ("n", "newton", "newtons"),
 }
 """Tag of a unit -> accepted spellings of metre and newton."""
+NO_UNIT = ("unassigned", "unknown")
+"""Words for a unit that OpenSim writes when it does not know the unit. OpenSim then computes in
+metres and newtons, as always."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +51,15 @@ class ModelReadSettings:
     """Oldest version of a file that is read, from OpenSim 2.3.2. Older files use other names."""
     massless_below: float = 2e-14
     """kg: a lighter body has no inertia, as in OpenSim's Body::getInertia."""
+    gravity_share: float = 0.01
+    """1: a notice names gravity that differs from standard gravity by more than this share. It
+    differs by 0.45 % at most between places at sea level."""
+    aligned: float = 1e-4
+    """rad: largest angle between gravity and an axis of ground that counts as rounding. It turns
+    0.01 % of the weight aside."""
+    longest: float = 3.0
+    """m: largest distance between joints on one body, in a file without a unit of length. Chosen
+    because no segment of a person is as long."""
 
 
 MODEL_READ = ModelReadSettings()
@@ -65,11 +80,14 @@ def read_osim(path: str | Path, partial: bool = False) -> OpenSimModel:
     """
     path = Path(path)
     root, notices = open_document(path)
-    document, model = _opened(root, path, partial)
+    document, model = _opened(root, path, partial, notices)
     bodies = _bodies(document, model)
-    frames = Frames.of(document, model, (GROUND, *bodies))
+    gravity = document.numbers(model, "gravity", count=3, default="0 -9.80665 0")
+    upright, ground_axes = _upright(gravity, notices)
+    frames = Frames.of(document, model, (GROUND, *bodies), upright)
     joints, coordinates = read_joints(document, model, frames)
-    wraps = read_wrap_objects(document, model)
+    _check_metres(document, model, joints)
+    wraps = read_wrap_objects(document, model, frames)
     muscles, ligaments, left_out = read_forces(document, model, frames, coordinates, wraps)
     couplers, distances, not_enforced = _constraints(document, model, frames, coordinates)
     left_out = [*left_out, *not_enforced]
@@ -79,7 +97,7 @@ def read_osim(path: str | Path, partial: bool = False) -> OpenSimModel:
     markers = _markers(document, model, frames)
     return OpenSimModel(
         name=model.get("name", path.stem),
-        gravity=document.numbers(model, "gravity", count=3, default="0 -9.80665 0"),
+        gravity=upright @ gravity,
         bodies=bodies,
         joints=ordered,
         coordinates=coordinates,
@@ -100,7 +118,62 @@ def read_osim(path: str | Path, partial: bool = False) -> OpenSimModel:
             for e, reason in document.unread
         ),
         notices=tuple(notices),
+        ground_axes=ground_axes,
     )
+
+
+def _upright(gravity: Array, notices: list[str]) -> tuple[Array, str | None]:
+    """Return the rotation (3, 3) of the file's ground to one whose y points up, and its axes.
+
+    It is the smallest such rotation. The axes are those of `OpenSimModel.ground_axes`. `notices`
+    gets a line if gravity is not that of a ground with y up.
+    """
+    size = float(np.linalg.norm(gravity))
+    if size == 0.0:
+        notices.append("its gravity is zero: y of ground is taken to point up")
+        return np.eye(3), "+x,+y,+z"
+    if abs(size / STANDARD_GRAVITY - 1.0) > MODEL_READ.gravity_share:
+        notices.append(f"its gravity is {size:.4g} m/s²; loads of a knee use {STANDARD_GRAVITY:g}")
+    up = -gravity / size
+    axis = int(np.argmax(np.abs(up)))
+    nearest = np.sign(up[axis]) * np.eye(3)[axis]
+    is_aligned = np.linalg.norm(up - nearest) <= MODEL_READ.aligned
+    turn = np.round(_least_turn(nearest)) if is_aligned else _least_turn(up)
+    words = " ".join(f"{value:g}" for value in gravity)
+    if not is_aligned:
+        notices.append(f"its gravity is {words}: ground is turned so that it points down along y")
+        return turn, None
+    rows = [(int(np.argmax(np.abs(row))), row.sum()) for row in turn]
+    axes = ",".join(f"{'+' if sign > 0 else '-'}{'xyz'[k]}" for k, sign in rows)
+    if axis != 1 or up[1] < 0.0:
+        notices.append(f"its gravity is {words}: forward, up, right are its ground's {axes}")
+    return turn, axes
+
+
+def _least_turn(up: Array) -> Array:
+    """Return the smallest rotation (3, 3) that turns a unit vector (3,) to y."""
+    axis = np.cross(up, [0.0, 1.0, 0.0])
+    sine = float(np.linalg.norm(axis))
+    if sine == 0.0:
+        return np.eye(3) if up[1] > 0.0 else np.diag([1.0, -1.0, -1.0])  # half a turn about x
+    return np.asarray(Rotation.from_rotvec(axis / sine * np.arctan2(sine, up[1])).as_matrix())
+
+
+def _check_metres(document: Document, model: Element, joints: list[Joint]) -> None:
+    """Raise an InputError if a file without a unit of length has lengths that no body has."""
+    word = (model.findtext("length_units") or "").strip()
+    if word.lower() not in NO_UNIT:
+        return
+    ends = [(j.parent, j.pose_parent_frame) for j in joints]
+    ends += [(j.child, j.pose_child_frame) for j in joints]
+    far = max((float(np.linalg.norm(p[:3, 3])) for body, p in ends if body != GROUND), default=0.0)
+    if far > MODEL_READ.longest:
+        raise InputError(
+            f"has length_units '{word}', and a joint {far:.4g} from the origin of its body, "
+            "which is no length in metres",
+            document.path,
+            "scale the model to metres in OpenSim",
+        )
 
 
 def _concerns(
@@ -118,8 +191,10 @@ def _concerns(
     return frozenset(named - {GROUND})
 
 
-def _opened(root: Element, path: Path, partial: bool) -> tuple[Document, Element]:
-    """Return the document and its <Model>.
+def _opened(
+    root: Element, path: Path, partial: bool, notices: list[str]
+) -> tuple[Document, Element]:
+    """Return the document and its <Model>. `notices` gets a line for each unit without a name.
 
     Raises:
         InputError: the file is no OpenSim model, is too old, or has units other than m and N.
@@ -139,7 +214,9 @@ def _opened(root: Element, path: Path, partial: bool) -> tuple[Document, Element
         )
     for tag, units in UNITS.items():
         result = (model.findtext(tag) or units[0]).strip()
-        if result.lower() not in (*units, ""):
+        if result.lower() in NO_UNIT:
+            notices.append(f"its {tag} is '{result}': {units[0]}, as in OpenSim")
+        elif result.lower() not in (*units, ""):
             hint = "scale the model to metres and newtons in OpenSim"
             raise InputError(f"has {tag} '{result}', only '{units[0]}' is read", path, hint)
     defaults = root.find("defaults")

@@ -17,6 +17,9 @@ X, Y, Z = np.eye(3)
 FRAMES = ("PhysicalOffsetFrame", "StationDefinedFrame")
 """Classes of frames that are fixed to a body or to another frame."""
 
+AXES = (*(f"rotation{k}" for k in (1, 2, 3)), *(f"translation{k}" for k in (1, 2, 3)))
+"""Names of the axes of a CustomJoint, in the order in which they act."""
+
 STANDARD_JOINTS: dict[str, tuple[tuple[Array, ...], tuple[Array, ...]]] = {
     "WeldJoint": ((), ()),
     "PinJoint": ((Z,), ()),
@@ -47,16 +50,20 @@ class Frames:
         bodies: names of the bodies, including ground.
         offsets: (owner, frame) -> the frame's parent, and the frame's pose (4, 4) in the parent.
         unread: name of a frame -> reason for which it could not be read.
+        upright: pose (4, 4) of the file's ground in a ground whose y points up.
     """
 
     document: Document
     bodies: frozenset[str]
     offsets: Mapping[tuple[str, str], tuple[str, Array]]
     unread: Mapping[str, str]
+    upright: Array
 
     @classmethod
-    def of(cls, document: Document, model: Element, bodies: Iterable[str]) -> "Frames":
-        """Return the frames of a model."""
+    def of(
+        cls, document: Document, model: Element, bodies: Iterable[str], upright: Array
+    ) -> "Frames":
+        """Return the frames of a model. `upright` turns the file's ground, shape (3, 3)."""
         offsets: dict[tuple[str, str], tuple[str, Array]] = {}
         stations = _stations(document, model)
         unread: dict[str, str] = {}
@@ -72,10 +79,12 @@ class Frames:
                 offsets[owner, name] = (parent, offset_pose(rotation, translation))
                 continue
             unread[element.get("name", "")] = document.unread[-1][1]
-        return cls(document, frozenset(bodies), offsets, unread)
+        return cls(document, frozenset(bodies), offsets, unread, pose(upright, np.zeros(3)))
 
     def resolve(self, user: Element, socket: str, owner: str = "") -> tuple[str, Array]:
         """Return the body of a socket's frame, and the pose (4, 4) of the frame in the body.
+
+        The pose in ground is that in the ground whose y points up.
 
         Args:
             user: the element with the socket, for messages.
@@ -94,7 +103,7 @@ class Frames:
             key = (owner_name, name) if (owner_name, name) in self.offsets else ("", name)
             if key not in self.offsets:
                 if name in self.bodies:
-                    return name, in_body
+                    return name, self.upright @ in_body if name == GROUND else in_body
                 if name in self.unread:
                     raise InputError(self.unread[name])
                 break
@@ -246,8 +255,8 @@ def _joint_frames(
         document.numbers(element, tag, count=3, default="0 0 0")
         for tag in ("orientation_in_parent", "location_in_parent", "orientation", "location")
     ]
-    parent, _ = frames.resolve(element, document.socket(element, "parent_body", "parent_body"))
-    return (parent, offset_pose(*values[:2])), (child, offset_pose(*values[2:]))
+    parent, base = frames.resolve(element, document.socket(element, "parent_body", "parent_body"))
+    return (parent, base @ offset_pose(*values[:2])), (child, offset_pose(*values[2:]))
 
 
 def _standard_axes(
@@ -279,14 +288,43 @@ def _custom_axes(
     transform_element = document.find(element, "SpatialTransform")
     if transform_element is None:
         raise InputError("has no <SpatialTransform>", document.where(element))
-    for k, entry in enumerate(transform_element.findall("TransformAxis")):
+    for name, entry in _named_axes(document, element, transform_element):
         axis = _axis(document, element, entry, names)
-        if k >= 6:
-            raise InputError("has more than six axes", document.where(element))
         no_effect = axis.coordinate is None and axis.function(np.zeros(1))[0] == 0.0
         if not no_effect:
-            kinds["rotation" if k < 3 else "translation"].append(axis)
+            kinds[name[:-1]].append(axis)
     return tuple(kinds["rotation"]), tuple(kinds["translation"])
+
+
+def _named_axes(
+    document: Document, joint: Element, spatial_transform: Element
+) -> list[tuple[str, Element]]:
+    """Return the names and elements of a joint's axes, in the order in which they act.
+
+    As in OpenSim, the name of an axis decides its place, not its position in the file. Axes without
+    any name are in the order of `AXES`.
+
+    Raises:
+        InputError: more than six axes, a name that is no axis, or two axes of one name.
+    """
+    entries: dict[str, Element] = {}
+    found: list[tuple[str, Element]] = []
+    for child in spatial_transform:
+        inner = child if child.tag == "TransformAxis" else child.find("TransformAxis")
+        if inner is not None:
+            name = child.get("name", "") if inner is child else child.tag
+            found.append((name.strip(), inner))
+    if len(found) > len(AXES):
+        raise InputError("has more than six axes", document.where(joint))
+    if not any(name for name, _ in found):
+        return [(name, entry) for name, (_, entry) in zip(AXES, found, strict=False)]
+    for name, entry in found:
+        if name not in AXES or name in entries:
+            what = "two axes" if name in entries else "an axis"
+            hint = f"name each axis once: {', '.join(AXES)}"
+            raise InputError(f"has {what} '{name}'", document.where(joint), hint)
+        entries[name] = entry
+    return [(name, entries[name]) for name in AXES if name in entries]
 
 
 def _axis(document: Document, joint: Element, entry: Element, names: list[str]) -> JointAxis:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
 from tkamb.io.opensim.document import Document, Element
 from tkamb.io.opensim.functions import Function
 from tkamb.io.opensim.model import (
@@ -47,7 +48,7 @@ SHAPES: dict[str, tuple[Shape, tuple[str, ...]]] = {
 METHODS = ("hybrid", "midpoint", "axial")
 
 
-def read_wrap_objects(document: Document, model: Element) -> dict[str, WrapObject]:
+def read_wrap_objects(document: Document, model: Element, frames: Frames) -> dict[str, WrapObject]:
     """Return name -> wrap object, of all bodies. The first of equal names counts, as in OpenSim.
 
     Raises:
@@ -58,12 +59,14 @@ def read_wrap_objects(document: Document, model: Element) -> dict[str, WrapObjec
     for body in (*ground, *document.objects(model, "BodySet")):
         for entry in document.objects(body, "WrapObjectSet"):
             with document.reading(entry):
-                wrap = _wrap_object(document, entry, document.name(body))
+                name, in_body = frames.resolve(entry, document.name(body))
+                wrap = _wrap_object(document, entry, name, in_body)
                 result.setdefault(wrap.name, wrap)
     return result
 
 
-def _wrap_object(document: Document, entry: Element, body: str) -> WrapObject:
+def _wrap_object(document: Document, entry: Element, body: str, in_body: Array) -> WrapObject:
+    """Return a wrap object, from the pose (4, 4) in the body of the frame that holds it."""
     if entry.tag not in SHAPES:
         raise InputError("is a wrap object that is not read", document.where(entry))
     shape, tags = SHAPES[entry.tag]
@@ -79,7 +82,7 @@ def _wrap_object(document: Document, entry: Element, body: str) -> WrapObject:
         document.name(entry),
         body,
         shape,
-        offset_pose(rotation, translation),
+        in_body @ offset_pose(rotation, translation),
         tuple(float(d) for d in dimensions),
         _quadrant(document, entry),
         document.flag(entry, "active", True),

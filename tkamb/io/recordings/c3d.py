@@ -12,6 +12,7 @@ Format: C3D user guide, https://www.c3d.org.
 
 import math
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -35,6 +36,11 @@ class C3dValueSettings:
 
 
 C3D_VALUE = C3dValueSettings()
+
+PLATE_PARAMETERS = ("USED", "TYPE", "CORNERS", "ORIGIN", "CHANNEL", "ZERO", "CAL_MATRIX", "UNITS")
+"""Parameters of the group FORCE_PLATFORM that are understood."""
+COP_POLYNOMIAL = "FPCOPPOLY"
+"""Kistler's polynomial for the centre of pressure, in axes whose sense the file does not state."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +108,11 @@ class Recording:
             parts.setdefault(error.what, []).append(part)
         unread = [f"not used: {', '.join(names)}: {what}" for what, names in parts.items()]
         return (*self.notices, *plate_notices, *unread)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """All notices, each with the name of the file."""
+        return tuple(f"{self.path.name}: {notice}" for notice in self.all_notices)
 
     def plate(self, number: int) -> ForcePlate:
         """Return a plate by its number.
@@ -195,7 +206,7 @@ class _Reader:
         used = {name for plate in plates for name in plate.channels}
         counts = Counter(names)
         free = [k for k, name in enumerate(names) if name not in used and counts[name] == 1]
-        notices = list(self.file.notices)
+        notices = [*self.file.notices, *self._unused_parameters()]
         notices += [f"has two markers '{name}'; neither is used" for name in equal]
         return Recording(
             self.path,
@@ -298,6 +309,25 @@ class _Reader:
             except InputError as error:
                 self.faults[f"plate {number}"] = error
         return tuple(plates)
+
+    def _unused_parameters(self) -> Iterator[str]:
+        """Yield a remark on each parameter of the plates with numbers that are not understood."""
+        group = "FORCE_PLATFORM:"
+        names = {*self._parameters.values, *self._parameters.damaged}
+        for name in sorted(name for name in names if name.startswith(group)):
+            values = self._parameters.values.get(name)
+            key = name.removeprefix(group)
+            is_text = isinstance(values, list)
+            if is_text or key.rstrip("0123456789") in PLATE_PARAMETERS:
+                continue
+            if key == COP_POLYNOMIAL:
+                if values is not None and np.any(values):
+                    yield (
+                        f"{name} is not applied: it corrects the centre of pressure of Kistler "
+                        "plates, mostly near their edges"
+                    )
+                continue
+            yield f"{name} is not understood, and not used"
 
     def _record(
         self, number: int, names: list[str], signals: Array, units: list[str], scale: float | None

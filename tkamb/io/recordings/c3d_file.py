@@ -13,7 +13,9 @@ Format: C3D user guide, https://www.c3d.org.
 """
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -169,8 +171,9 @@ def parse_c3d(content: bytes, path: Path) -> C3dFile:
     end = (header.data_block - 1) * BLOCK
     records = _parameters(content, start + 4, end if end > start else len(content), machine)
     parameters = Parameters(path, *records)
-    _check_agreement(header, parameters, path)
-    return _Data(content, header, parameters, machine, path).read()
+    header, notices = _agreed_header(content, header, parameters, machine, path)
+    _check_scale(header, parameters, path)
+    return _Data(content, header, parameters, machine, path).read(notices)
 
 
 def _header(content: bytes, machine: int) -> Header:
@@ -268,15 +271,65 @@ def _value(record: bytes, machine: int) -> Any:
     return np.frombuffer(body, number).astype(float).reshape(shape, order="F")
 
 
-def _check_agreement(header: Header, parameters: Parameters, path: Path) -> None:
-    """Raise if header and parameters contradict each other on the layout of the data."""
+def _agreed_header(
+    content: bytes, header: Header, parameters: Parameters, machine: int, path: Path
+) -> tuple[Header, list[str]]:
+    """Return the header whose layout fits the file, and a notice if parameters contradict it.
+
+    If header and parameters contradict each other, the frames of exactly one of their layouts must
+    end within the last block of the file.
+
+    Raises:
+        InputError: they contradict each other, and the size of the file does not decide.
+    """
+    error = _disagreement(header, parameters, path)
+    if error is None:
+        return header, []
+    layouts: dict[tuple[int, int, bool], Header] = {}
+    stated = list(_layouts(header, parameters))
+    stated.sort(key=lambda other: _disagreement(other, parameters, path) is not None)
+    for other in stated:
+        if _Data(content, other, parameters, machine, path).fits():
+            layouts.setdefault((other.markers, other.analog, other.scale < 0), other)
+    if len(layouts) != 1:
+        raise error
+    (result,) = layouts.values()
+    kind = "floats" if result.scale < 0 else "integers"
+    return result, [
+        f"{error.what}; the size of the file fits {result.markers} markers and {result.channels} "
+        f"analog channels with {result.samples} samples per frame, as {kind}"
+    ]
+
+
+def _layouts(header: Header, parameters: Parameters) -> Iterator[Header]:
+    """Yield the headers of all layouts that header and parameters state between them.
+
+    Some programs write the number of channels as the number of analog values per frame.
+    """
+    used = parameters.integers("ANALOG:USED")[:1]
+    rates = [parameters.number(f"{group}:RATE") or 0.0 for group in ("ANALOG", "POINT")]
+    ratio = [round(rates[0] / rates[1])] if all(math.isfinite(r) and r > 0 for r in rates) else []
+    scale = parameters.number("POINT:SCALE")
+    scales = [header.scale, *([] if scale is None else [scale])]
+    for samples, channels in product([header.samples, *ratio], [*used, header.analog, None]):
+        if channels is None and (not samples or header.analog % samples):
+            continue
+        analog = header.analog if channels is None else channels * samples
+        markers = [header.markers, *parameters.integers("POINT:USED")[:1]]
+        for count, size in product(markers, scales):
+            if math.isfinite(size) and size != 0:
+                yield replace(header, markers=count, analog=analog, samples=samples, scale=size)
+
+
+def _disagreement(header: Header, parameters: Parameters, path: Path) -> InputError | None:
+    """Return how header and parameters contradict each other on the layout of the data, or None."""
     used = parameters.integers("POINT:USED")
     if used and used[0] != header.markers:
-        raise InputError(
+        return InputError(
             f"holds {header.markers} markers by its header, {used[0]} by POINT:USED", path, EXPORT
         )
     if header.analog and (not header.samples or header.analog % header.samples):
-        raise InputError(
+        return InputError(
             f"states {header.analog} analog values per frame, which is no multiple of its "
             f"{header.samples} samples per frame",
             path,
@@ -284,21 +337,27 @@ def _check_agreement(header: Header, parameters: Parameters, path: Path) -> None
         )
     channels = parameters.integers("ANALOG:USED")
     if channels and header.analog and channels[0] != header.channels:
-        raise InputError(
+        return InputError(
             f"holds {header.channels} analog channels by its header, {channels[0]} by ANALOG:USED",
             path,
             EXPORT,
         )
     scale = parameters.number("POINT:SCALE")
-    if not math.isfinite(header.scale) or (header.scale == 0 and header.markers):
-        raise InputError(f"has a scale of {header.scale:g} for its markers", path, EXPORT)
     stored_otherwise = scale is not None and (scale < 0) != (header.scale < 0)
     if stored_otherwise and (header.markers or header.analog):
-        raise InputError(
+        return InputError(
             "holds floats by its header and integers by POINT:SCALE, or the reverse", path, EXPORT
         )
+    return None
+
+
+def _check_scale(header: Header, parameters: Parameters, path: Path) -> None:
+    """Raise if the markers have no scale, or two."""
+    if not math.isfinite(header.scale) or (header.scale == 0 and header.markers):
+        raise InputError(f"has a scale of {header.scale:g} for its markers", path, EXPORT)
+    scale = parameters.number("POINT:SCALE")
     differs = scale is not None and not math.isclose(scale, header.scale, rel_tol=1e-3)
-    if header.scale > 0 and header.markers and differs:
+    if header.scale > 0 and header.markers and differs and scale is not None and scale > 0:
         raise InputError(
             f"has a scale of {header.scale:g} by its header, {scale:g} by POINT:SCALE", path, EXPORT
         )
@@ -323,11 +382,16 @@ class _Data:
         """Bytes of a frame."""
         return (4 * self.header.markers + self.header.analog) * self._word
 
-    def read(self) -> C3dFile:
-        """Return the file with its frames."""
+    def fits(self) -> bool:
+        """Return whether the frames, from a stated block, end within the file's last block."""
+        stated = [self.header.data_block, *self.parameters.integers("POINT:DATA_START")[:1]]
+        blocks = [block for block in stated if block > self.content[0]]
+        return self._frame > 0 and any(self._fits((block - 1) * BLOCK) for block in blocks)
+
+    def read(self, notices: list[str]) -> C3dFile:
+        """Return the file with its frames. `notices` are those of the header."""
         if not self._frame:
-            raise InputError("holds neither markers nor analog channels", self.path, EXPORT)
-        notices: list[str] = []
+            raise self._empty()
         start = self._start(notices)
         stored = max(len(self.content) - start, 0) // self._frame
         count = self._count(stored, notices)
@@ -339,6 +403,18 @@ class _Data:
         first = self._first()
         return C3dFile(
             self.header, self.parameters, first, points, residual, analog, tuple(notices)
+        )
+
+    def _empty(self) -> InputError:
+        """Return the error for a file without markers and analog channels."""
+        rotations = self.parameters.texts("ROTATION:LABELS")
+        if not rotations and not self.parameters.integers("ROTATION:USED"):
+            return InputError("holds neither markers nor analog channels", self.path, EXPORT)
+        count = (self.parameters.integers("ROTATION:USED") or [len(rotations)])[0]
+        return InputError(
+            f"holds rotations of {count} segments, and no markers",
+            self.path,
+            "export marker positions, or joint angles of the model for --motion",
         )
 
     def _start(self, notices: list[str]) -> int:

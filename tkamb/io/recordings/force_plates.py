@@ -33,6 +33,7 @@ import numpy as np
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
+from tkamb.io.recordings.plate_pressure import other_units, pressure_range
 from tkamb.io.recordings.unit_words import GivenUnits, metres, newton_metres, newtons
 
 CHANNELS = {1: 6, 2: 6, 3: 8, 4: 6, 5: 8}
@@ -43,7 +44,7 @@ _log = logging.getLogger("tkamb")
 
 @dataclass(frozen=True)
 class PlateSettings:
-    """Checks of the baseline and the units of a force plate."""
+    """Checks of the baseline of a force plate."""
 
     steady_N: float = 10.0
     """N: largest standard deviation of the vertical force of an unloaded plate, over the frames of
@@ -54,12 +55,6 @@ class PlateSettings:
     baseline_share: float = 0.2
     """1: as `baseline_N`, but a share of the largest change of the vertical force; the larger limit
     holds. Chosen because a standing person exerts more."""
-    loaded_N: float = 100.0
-    """N: vertical force above which the centre of pressure is checked. Chosen because a smaller
-    force makes it a quotient of small numbers."""
-    beside: float = 0.2
-    """1: share of the plate's half width by which the centre of pressure may lie outside the
-    corners. Chosen because a loaded plate has smaller errors."""
 
 
 SETTINGS = PlateSettings()
@@ -83,6 +78,8 @@ class PlateRecord:
         zero: samples in which the file states the plate as unloaded, or None.
         given: the user's units.
         where: file and plate, for messages.
+        moment_length: metres that stand for the length in moments, or in the points of type 1 and
+            the ORIGIN of type 3; None: as the units state.
     """
 
     number: int
@@ -98,6 +95,7 @@ class PlateRecord:
     zero: slice | None
     given: GivenUnits
     where: str
+    moment_length: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,11 +159,74 @@ def force_plate(record: PlateRecord) -> ForcePlate:
         if reason:
             notices += (reason,)
         elif np.isfinite(level).all():
-            signals = record.signals - level[:, None]
-            force, moment, notices = _read(replace(record, signals=signals))
+            record = replace(record, signals=record.signals - level[:, None])
+            force, moment, notices = _read(record)
+    force, moment, more = _in_possible_unit(record, force, moment)
+    notices += more
     return ForcePlate(
         record.number, record.names, record.corners, force @ axes.T, moment @ axes.T, notices
     )
+
+
+def _in_possible_unit(
+    record: PlateRecord, force: Array, moment: Array
+) -> tuple[Array, Array, tuple[str, ...]]:
+    """Return force and moment in the unit that puts the centre of pressure on the plate.
+
+    Another unit is used, with a notice, only if the file's unit is impossible and exactly one other
+    is possible. A unit that the user gives is kept.
+
+    Args:
+        record: the plate.
+        force: (k, 3) N, as stated, in the plate's axes.
+        moment: (k, 3) N·m about the surface's centre, as stated, in the plate's axes.
+    """
+    stated = pressure_range(record.corners, force, moment, _above_transducers(record))
+    if stated is None or not (stated.beside or stated.resting):
+        return force, moment, ()
+    given = record.given.length if record.kind in (1, 3) else record.given.moment
+    for units in other_units(_stated_length(record)) if given is None else ():
+        possible = []
+        for name, length in units:
+            other = replace(record, moment_length=length)
+            result = _read(other)[:2]
+            where = pressure_range(record.corners, *result, _above_transducers(other))
+            if where is not None and where.usual:
+                possible.append((name, result))
+        if len(possible) == 1:
+            name, result = possible[0]
+            quantity = {1: "points", 3: "ORIGIN"}.get(record.kind, "moments")
+            unit = name if record.kind in (1, 3) else f"N·{name}"
+            return *result, (
+                f"force plate {record.number}: with its stated unit of {quantity} the centre of "
+                f"pressure {'is beside the plate' if stated.beside else 'never moves'}; {unit} "
+                "puts it under a foot and is used",
+            )
+    problem = (
+        f"lies beside the plate, at {stated.median.max():.1f} half widths from its centre"
+        if stated.beside
+        else "never moves from the transducers' origin"
+    )
+    words = f"the centre of pressure {problem}: check units, CORNERS and ORIGIN"
+    return force, moment, (f"force plate {record.number}: {words}",)
+
+
+def _above_transducers(record: PlateRecord) -> Array:
+    """Return the vector (3,) m from the transducers' origin to the surface's centre."""
+    if record.kind == 1:
+        return np.zeros(3)
+    return record.origin * (np.array([0.0, 0.0, 1.0]) if record.kind == 3 else 1.0)
+
+
+def _stated_length(record: PlateRecord) -> float:
+    """Return the metres that stand for the length in moments, points (type 1) or ORIGIN (3)."""
+    if record.kind == 3:
+        return record.metres_per_unit
+    if record.kind in _CALIBRATED:
+        stated = _stated_scales(record) if record.kind == 4 else None
+        return record.metres_per_unit if stated is None else float(stated[3] / stated[0])
+    scales = _scales(record)
+    return float(scales[3] if record.kind == 1 else scales[3] / scales[0])
 
 
 def _loaded_in_zero(record: PlateRecord, force: Array) -> str:
@@ -189,9 +250,14 @@ def _read(record: PlateRecord) -> tuple[Array, Array, tuple[str, ...]]:
 
     Force and moment are in the plate's axes.
     """
+    length = record.moment_length
     if record.kind not in _CALIBRATED:
-        signals = record.signals * _scales(record)[:, None]
-        return (*_wrench(record.kind, signals, record.origin), ())
+        factors, origin = _scales(record), record.origin
+        if length is not None and record.kind == 3:
+            origin = origin * length / record.metres_per_unit
+        elif length is not None:
+            factors[3:] = [length, length, factors[5]] if record.kind == 1 else factors[:3] * length
+        return (*_wrench(record.kind, record.signals * factors[:, None], origin), ())
     matrix = record.calibration
     stated = _stated_scales(record) if record.kind == 4 else None
     if matrix is None and stated is not None:
@@ -202,15 +268,15 @@ def _read(record: PlateRecord) -> tuple[Array, Array, tuple[str, ...]]:
     unit = newtons(record.given.force or record.force_unit)
     if unit is None:
         raise _no_unit(record, record.force_unit, "force_unit", "N")
-    scales = np.repeat([unit, unit * record.metres_per_unit], 3)
+    scales = np.repeat([unit, unit * (length or record.metres_per_unit)], 3)
     if record.given.moment is not None:
         scales[3:] = _given_moment(record)
     wrench = matrix @ record.signals
     result = _wrench(2, wrench * scales[:, None], record.origin)
-    if stated is None or np.allclose(stated, scales, rtol=1e-9):
+    if length is not None or stated is None or np.allclose(stated, scales, rtol=1e-9):
         return (*result, ())
     other = _wrench(2, wrench * stated[:, None], record.origin)
-    inside = [_on_plate(record.corners, *candidate) for candidate in (result, other)]
+    inside = [_on_plate(record, *candidate) for candidate in (result, other)]
     if inside[0] == inside[1]:
         raise InputError(
             f"is of type {record.kind}, and its channels state another unit of moment than "
@@ -221,15 +287,10 @@ def _read(record: PlateRecord) -> tuple[Array, Array, tuple[str, ...]]:
     return (*(result if inside[0] else other), ())
 
 
-def _on_plate(corners: Array, force: Array, moment: Array) -> bool:
-    """Return whether the centre of pressure of the loaded plate lies on its surface."""
-    loaded = np.abs(force[:, 2]) > SETTINGS.loaded_N
-    if not loaded.any():
-        return True
-    half = 0.5 * np.linalg.norm([corners[0] - corners[1], corners[0] - corners[3]], axis=1)
-    point = np.stack([-moment[loaded, 1], moment[loaded, 0]], axis=1) / force[loaded, 2:3]
-    share = np.median(np.abs(point), axis=0) / half
-    return bool((share <= 1.0 + SETTINGS.beside).all() and (share > 1e-3).any())
+def _on_plate(record: PlateRecord, force: Array, moment: Array) -> bool:
+    """Return whether the centre of pressure is on the plate, or the plate is not loaded."""
+    where = pressure_range(record.corners, force, moment, _above_transducers(record))
+    return where is None or where.usual
 
 
 def _wrench(kind: int, s: Array, origin: Array) -> tuple[Array, Array]:

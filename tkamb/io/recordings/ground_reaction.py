@@ -78,7 +78,7 @@ class GroundReaction:
         odd: recorded samples around the frames that lie off the curve of their neighbours.
         level_assumed: whether the plate's height is assumed to be 0, because no column states it.
         drift: number of a plate -> vertical force of the unloaded plate, N, if it is large.
-        notices: remarks on the parts of the file that were used.
+        remarks: notices on the file and on the parts of it that were used.
         gait: stances in the recording; None if not computed.
     """
 
@@ -89,7 +89,7 @@ class GroundReaction:
     odd: tuple[OddSample, ...] = ()
     level_assumed: bool = False
     drift: dict[int, float] = field(default_factory=dict)
-    notices: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
     gait: Gait | None = None
 
 
@@ -104,7 +104,7 @@ class RecordedReaction:
         moment: (k, 3) N·m about `point`.
         level_assumed: whether no column states the plate's height.
         drift: as in `GroundReaction`.
-        notices: as in `GroundReaction`.
+        remarks: as in `GroundReaction`.
     """
 
     time: Array
@@ -113,7 +113,7 @@ class RecordedReaction:
     moment: Array
     level_assumed: bool = False
     drift: dict[int, float] = field(default_factory=dict)
-    notices: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     def part(self, rows: slice) -> "RecordedReaction":
         """Return the samples of a slice."""
@@ -169,7 +169,7 @@ def load_ground_reaction(source: GroundReactionTable, time: Array, side: Side) -
         odd=odd,
         level_assumed=recorded.level_assumed,
         drift=recorded.drift,
-        notices=recorded.notices,
+        remarks=recorded.remarks,
         gait=find_gait(stamps, force[:, 1]),
     )
 
@@ -251,8 +251,8 @@ def _complete_part(
     end = last + int(after[0]) if len(after) else len(stamps)
     part = recorded.part(slice(start, end))
     interval = f"{part.time[0]:.4f} to {part.time[-1]:.4f} s"
-    notice = f"used from {interval}: values before or after are not numbers"
-    return replace(part, notices=(*part.notices, notice))
+    remark = f"{source.file.name}: used from {interval}: values before or after are not numbers"
+    return replace(part, remarks=(*part.remarks, remark))
 
 
 def _read_table(source: GroundReactionTable) -> RecordedReaction:
@@ -273,7 +273,8 @@ def _read_table(source: GroundReactionTable) -> RecordedReaction:
     recorded = read_table(source.file, source.format)
     stamps = recorded.time(source.columns.get("time", "time"))
     level_assumed = _upright_point(source) not in {*source.columns, *recorded.columns}
-    return RecordedReaction(stamps, *_read_columns(source, recorded), level_assumed)
+    values = _read_columns(source, recorded)
+    return RecordedReaction(stamps, *values, level_assumed, remarks=recorded.remarks)
 
 
 def _odd_samples(
@@ -326,7 +327,8 @@ def check_under_foot(ground: GroundReaction, ankle: Array, path: Path) -> None:
         raise InputError(
             f"the centre of pressure lies up to {farthest:.3g} m from the ankle",
             path,
-            "check [ground_reaction] length_unit, columns and laboratory_axes, and [tibia]",
+            "check [ground_reaction] length_unit, columns and laboratory_axes, [tibia], and the "
+            "clocks of both files",
         )
 
 
@@ -414,9 +416,8 @@ def _read_plates(source: GroundReactionTable) -> RecordedReaction:
         source.unloaded_N,
         source.file,
     )
-    notices = tuple(notice for plate in plates for notice in plate.notices)
     return RecordedReaction(
-        recording.analog_time, force, point, moment, drift=drift, notices=notices
+        recording.analog_time, force, point, moment, drift=drift, remarks=recording.remarks
     )
 
 

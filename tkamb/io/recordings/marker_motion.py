@@ -35,6 +35,7 @@ from tkamb.io.recordings.inverse_kinematics import (
 from tkamb.io.recordings.laboratory import laboratory_rotation
 from tkamb.io.recordings.markers import MARKER_FIT, fit_seen, marker_trajectories
 from tkamb.io.recordings.recording_tables import MarkersTable, MotionTable, Side
+from tkamb.io.recordings.samples import check_spacing
 from tkamb.io.recordings.tables import Table, read_table
 from tkamb.io.recordings.tibia import BodyMotion
 from tkamb.units import DEGREE, MILLIMETRE
@@ -70,6 +71,7 @@ class MarkerKinematics:
         centre_distance: (n,) m, distance between the knee centres by the separate fits of shank
             and thigh.
         missing: (n,) number of missing markers of shank and thigh.
+        remarks: notices on the file.
     """
 
     time: Array
@@ -80,6 +82,7 @@ class MarkerKinematics:
     rms: dict[Method, Array]
     centre_distance: Array
     missing: np.ndarray
+    remarks: tuple[str, ...] = ()
 
     def at(self, values: Array, time: Array) -> Array:
         """Return values (n,) of the frames at other times, s, by linear interpolation."""
@@ -91,7 +94,7 @@ class MarkerKinematics:
             self.time, self.tibia, cutoff_Hz, time, name
         )
         residual = self.at(self.rms[self.method], time)
-        return BodyMotion(time, filtered, velocity, acceleration, residual)
+        return BodyMotion(time, filtered, velocity, acceleration, residual, remarks=self.remarks)
 
 
 def load_marker_motion(
@@ -111,6 +114,7 @@ def load_marker_motion(
     assert source.markers is not None
     recorded = read_table(source.file, source.format)
     time = recorded.time()
+    check_spacing(recorded.path, time)
     segments, measured = leg_segments(source.markers, recorded, source.length_unit, side)
     neutral = neutral_coordinates(source.markers, side)
     chain = LegChain(segments, pose_insert_in_tibia, source.markers.knee == "free")
@@ -260,6 +264,7 @@ def _compare_readings(
         {name: values[run] for name, values in rms.items()},
         np.linalg.norm(knees["segments"][run, :3] - neutral[:3], axis=1),
         missing.sum(axis=1)[run],
+        recorded.remarks,
     )
 
 

@@ -48,11 +48,13 @@ class MeasuredForce:
         path: the file.
         time: (n,) s, on the clock of the motion.
         force: "total", "medial" or "lateral", if known -> (n,) N, gaps NaN.
+        remarks: notices on the file.
     """
 
     path: Path
     time: Array
     force: dict[str, Array]
+    remarks: tuple[str, ...] = ()
 
     def at(self, time: Array) -> dict[str, Array]:
         """Return the forces (f,) N at times (f,) s, by linear interpolation.
@@ -92,7 +94,7 @@ def load_measured_force(source: MeasuredTable, time: Array) -> MeasuredForce:
         if role != "time"
     }
     check_overlap(source.file, clock, time, "[measured]")
-    return MeasuredForce(source.file, clock, _with_third(force))
+    return MeasuredForce(source.file, clock, _with_third(force), table.remarks)
 
 
 def _sum(table: Table, column: str | dict[str, float]) -> Array:
@@ -138,6 +140,7 @@ class Envelopes:
         values: channel -> (n,), 1 at the normalising value.
         channel_of: muscle -> channel.
         normalised_by: channel -> the normalising value, in the file's unit.
+        remarks: notices on the file.
     """
 
     path: Path
@@ -145,6 +148,7 @@ class Envelopes:
     values: dict[str, Array]
     channel_of: dict[str, str]
     normalised_by: dict[str, float]
+    remarks: tuple[str, ...] = ()
 
     def at(self, muscle: str, time: Array) -> Array:
         """Return a muscle's envelope (f,) at times (f,) s; NaN outside the recording."""
@@ -164,7 +168,7 @@ def load_envelopes(source: EmgTable, motion: Array) -> Envelopes:
             samples, a cut-off above half the rate, too short a recording, or a channel without
             signal.
     """
-    time, signals = _signals(source)
+    time, signals, remarks = _signals(source)
     step = np.diff(time)
     if len(step) < 2 or np.abs(step - np.median(step)).max() > EMG.step_tolerance * np.median(step):
         raise InputError("has EMG that is not sampled evenly", source.file, "resample it")
@@ -186,7 +190,7 @@ def load_envelopes(source: EmgTable, motion: Array) -> Envelopes:
             raise InputError(f"channel '{channel}' holds no signal", source.file, "leave it out")
         values[channel] = result / normalised_by[channel]
     muscles = {muscle: channel for channel, names in source.channels.items() for muscle in names}
-    return Envelopes(source.file, time + source.offset_s, values, muscles, normalised_by)
+    return Envelopes(source.file, time + source.offset_s, values, muscles, normalised_by, remarks)
 
 
 def envelope(
@@ -234,14 +238,15 @@ def _low_passed(signal: Array, cutoff: float) -> Array:
     return np.fft.irfft(spectrum, len(mirrored))[: len(signal)]
 
 
-def _signals(source: EmgTable) -> tuple[Array, dict[str, Array]]:
-    """Return times (n,) s on the file's clock and channel -> (n,)."""
+def _signals(source: EmgTable) -> tuple[Array, dict[str, Array], tuple[str, ...]]:
+    """Return times (n,) s on the file's clock, channel -> (n,), and notices on the file."""
     if source.file.suffix.lower() != ".c3d":
         table = read_table(source.file)
         time = table.time(source.time)
-        return time, {name: table.complete_column(name) for name in source.channels}
+        channels = {name: table.complete_column(name) for name in source.channels}
+        return time, channels, table.remarks
     from tkamb.io.recordings.c3d import read_c3d
 
     recording = read_c3d(source.file)
     signals = {name: recording.channel(name) for name in source.channels}
-    return recording.analog_time, signals
+    return recording.analog_time, signals, recording.remarks

@@ -1,6 +1,7 @@
 """Surfaces from mesh files, in SI units and anatomical axes, with small defects repaired."""
 
 import logging
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -39,6 +40,11 @@ class MeshFileSettings:
     rounding_limit: float = 5e-6
     """m: a mesh with coarser rounding of coordinates is refused. Chosen because 8 µm change forces
     by 4 %."""
+    header_bytes: int = 4096
+    """Number of bytes in which a file's space is searched. Chosen because headers are shorter."""
+    stacked_share: float = 0.3
+    """1: area of the wall between touching bodies, in the plan view, from which one body lies on
+    the other, as a share of the part's extents. Chosen: a post covers less, a tray more."""
     sheet_opening: float = 1.0 / 3.0
     """1: widest hole of a part, as a share of its length. A part with a wider hole is an open
     sheet. Chosen because holes of damaged files are smaller."""
@@ -122,13 +128,17 @@ def load_surface(
             f"unknown unit '{unit}' of {name}", path, f"use one of {', '.join(LENGTH)}"
         )
     vertices, faces = read_triangles(path)
+    _check_space(path, axes)
     _check_size(vertices[faces.reshape(-1)], unit, path, name, size)
     _check_rounding(vertices[faces.reshape(-1)], unit, path, name)
     mended = repair(vertices * LENGTH[unit], faces)
     _check_surface(mended, path, name, unit)
     wall = None
     if closed and size == IMPLANT_SIZE and not mended.holes:
-        mended, wall = _without_inner_wall(mended, unit)
+        wall = find_inner_wall(mended.vertices, mended.faces)
+        if wall is not None:
+            _check_stacked(mended, wall, path, name, rotation[1], unit)
+            mended, wall = _without_inner_wall(mended, wall, unit)
     if size == IMPLANT_SIZE:
         _check_part(mended, path, name, rotation[2], wall)
     if closed and mended.holes:
@@ -141,6 +151,56 @@ def load_surface(
     if size == IMPLANT_SIZE:
         _check_knee_width(surface, path)
     return surface
+
+
+SPACES = {"LPS": "-y,+z,-x", "RAS": "+y,+z,+x"}
+"""Space that a mesh file names -> its axes that point anterior, superior and to the right."""
+_SPACE = re.compile(rb"SPACE\W{0,3}(?:=|:)?\s*\W?(LPS|RAS)\b", re.IGNORECASE)
+_SPACE_ARRAY = re.compile(
+    rb"<(?:Data)?Array[^>]*Name=[\"']SPACE[\"'][^>]*>([\d\s]+)<", re.IGNORECASE
+)
+
+
+def space_of(path: str | Path) -> str | None:
+    """Return the space, "LPS" or "RAS", that the header of a mesh file names; None without one.
+
+    Headers are that of STL, comments of PLY and OBJ, and comments and field data (text) of VTP.
+    """
+    try:
+        with open(path, "rb") as file:
+            head = file.read(MESH_FILE.header_bytes)
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", path) from error
+    if Path(path).suffix.lower() == ".stl":
+        head = head.split(b"\n")[0][:80]
+    if (array := _SPACE_ARRAY.search(head)) is not None:  # a text array holds character codes
+        head = b"SPACE=" + bytes(int(code) % 256 for code in array[1].split() if int(code))
+    found = _SPACE.search(head)
+    return None if found is None else found[1].decode().upper()
+
+
+def check_same_space(first: str | Path, second: str | Path) -> None:
+    """Raise an InputError if two files that share axes name different spaces."""
+    spaces = space_of(first), space_of(second)
+    if None not in spaces and spaces[0] != spaces[1]:
+        raise InputError(
+            f"names the space {spaces[1]} in its header, but {first} names {spaces[0]}",
+            second,
+            "export both meshes in the same space",
+        )
+
+
+def _check_space(path: str | Path, axes: str) -> None:
+    """Raise an InputError if the axes contradict the space that the file names."""
+    space = space_of(path)
+    if space is not None and not np.array_equal(axes_rotation(axes), axes_rotation(SPACES[space])):
+        raise InputError(
+            f"names the space {space} in its header, so that its axes are {SPACES[space]}, not "
+            f"{axes}",
+            path,
+            f"give axes {SPACES[space]}; if the mesh was moved to other axes, delete the space "
+            "from its header",
+        )
 
 
 def mirrored(surface: Surface) -> Surface:
@@ -244,11 +304,38 @@ def _opposite(names: list[str]) -> str:
     return ",".join([*names[:2], reversed_axis])
 
 
-def _without_inner_wall(mended: Repair, unit: str) -> tuple[Repair, InnerWall | None]:
+def _check_stacked(
+    mended: Repair, wall: InnerWall, path: str | Path, name: str, up: Array, unit: str
+) -> None:
+    """Raise an InputError if a part consists of bodies that lie on each other, like a tray.
+
+    Args:
+        mended: the part.
+        wall: its inner wall.
+        path: its file.
+        name: name of the part.
+        up: (3,) superior direction in the file's axes.
+        unit: unit of the file.
+    """
+    surface = Surface(mended.vertices, mended.faces, name, merged=True)
+    level = 0.5 * float(surface.areas[wall.faces] @ np.abs(surface.face_normals[wall.faces] @ up))
+    across = np.ptp(mended.vertices, axis=0)[np.abs(up) < 0.5]
+    if level < MESH_FILE.stacked_share * float(across.prod()):
+        return
+    where = ", ".join(f"{round(value / LENGTH[unit], 2) + 0.0:g}" for value in wall.centre)
+    raise InputError(
+        f"{name} holds bodies that lie on each other, like an insert on its tray: they touch on "
+        f"{1e6 * level:.0f} mm² at ({where}) {unit}",
+        path,
+        "give the insert alone (`tkamb mesh part` writes one body); if all of it is polyethylene, "
+        "unite the bodies in the CAD program",
+    )
+
+
+def _without_inner_wall(
+    mended: Repair, wall: InnerWall, unit: str
+) -> tuple[Repair, InnerWall | None]:
     """Return the part without its inner wall, or the part and a wall that cannot be removed."""
-    wall = find_inner_wall(mended.vertices, mended.faces)
-    if wall is None:
-        return mended, None
     where = ", ".join(f"{round(value / LENGTH[unit], 2) + 0.0:g}" for value in wall.centre)
     words = f"inner wall of {1e6 * wall.area:.0f} mm² at ({where}) {unit} between touching bodies"
     if wall.without is None:

@@ -87,6 +87,7 @@ class KneeMotion:
         unrecorded: coordinates without a column; they are zero.
         odd: samples off their neighbours' curve.
         markers: kinematics by skin markers, if the motion comes from markers.
+        remarks: notices on the file.
     """
 
     time: Array
@@ -104,6 +105,7 @@ class KneeMotion:
     unrecorded: tuple[str, ...] = ()
     odd: tuple[OddSample, ...] = ()
     markers: "MarkerKinematics | None" = None
+    remarks: tuple[str, ...] = ()
 
 
 def load_motion(
@@ -159,7 +161,7 @@ def load_motion(
     if patella is not None:
         _check_patella(patella, recorded.path)
     motion = _differentiate(time, knee, patella, source, recorded.path)
-    return replace(motion, unrecorded=unrecorded)
+    return replace(motion, unrecorded=unrecorded, remarks=recorded.remarks)
 
 
 def _from_markers(
@@ -183,7 +185,7 @@ def _from_markers(
         knee[:, KNEE_COORDINATES.index(name)] = 0.0
     _check_knee(knee, source.file)
     motion = _differentiate(result.time, knee, None, source, source.file)
-    return replace(motion, unrecorded=unrecorded, markers=result)
+    return replace(motion, unrecorded=unrecorded, markers=result, remarks=result.remarks)
 
 
 def _find_unrecorded(
@@ -346,6 +348,9 @@ def _differentiate(
 def _frames(sampled: Array, source: MotionTable, cycle: Cycle | None) -> Array:
     if cycle:
         return cycle.frames(sampled, source.frames)
+    if len(sampled) < 2:
+        hint = "give two rows or more: rates need them"
+        raise InputError(f"holds {len(sampled)} row of motion", source.file, hint)
     start, end = source.interval_s or (sampled[0], sampled[-1])
     inside = sampled[(sampled >= start - 1e-9) & (sampled <= end + 1e-9)]
     if len(inside) < 2 or start < sampled[0] - 1e-9 or end > sampled[-1] + 1e-9:

@@ -103,7 +103,10 @@ def _running_median(away: Array) -> Array:
 
 
 def check_spacing(path: Path, time: Array) -> None:
-    """Raise an InputError if samples at times (n,) s are too far apart for a movement."""
+    """Raise an InputError if samples at times (n,) s are no movement: one, or too far apart."""
+    if len(time) == 1:
+        what = f"has one row, at {time[0]:g} s, which is no movement"
+        raise InputError(what, path, "give a recording of several rows")
     spacing = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
     if spacing > SAMPLE.max_step:
         raise InputError(

@@ -1,6 +1,5 @@
 """Read recorded tables: `.csv`, OpenSim `.sto` and `.mot`, and markers of `.trc` and `.c3d`."""
 
-import codecs
 import contextlib
 import math
 import re
@@ -12,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from tkamb.errors import InputError, names_near
-from tkamb.files import FILE_LIMITS, read_bytes
 from tkamb.geometry.frames import Array
+from tkamb.io.recordings.table_lines import SEPARATORS, read_lines, tab_separated
 from tkamb.io.recordings.unit_words import GivenUnits, metres
 from tkamb.units import LENGTH
 
@@ -30,6 +29,8 @@ class TableValueSettings:
 
 TABLE_VALUE = TableValueSettings()
 
+TRC_LABELS = 3
+"""Index of the line of a `.trc` with the markers' labels."""
 
 _NOT_A_NUMBER = re.compile(r"[+-]?(nan(\(\w*\))?|1\.#(ind|qnan)0*)")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?")
@@ -37,7 +38,7 @@ _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?")
 _NUMBER_CHARACTERS = "0123456789+-.eE "
 """Characters of plain decimal numbers."""
 _INFINITE = re.compile(r"[+-]?inf(inity)?")
-_COMMA_NUMBER = re.compile(r"[+-]?[0-9]+,[0-9]+")
+_COMMA_NUMBER = re.compile(r"[+-]?[0-9]*,[0-9]+([eE][+-]?[0-9]{1,3})?")
 STATED_DEGREES = {"yes": True, "true": True, "1": True, "no": False, "false": False, "0": False}
 """Words after `inDegrees=` in a storage file -> whether angles are in degrees."""
 
@@ -65,6 +66,11 @@ class Table:
     notices: tuple[str, ...] = ()
     unit_given: bool = False
     unit_word: str = ""
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """The notices, each with the name of the file."""
+        return tuple(f"{self.path.name}: {notice}" for notice in self.notices)
 
     @property
     def rows(self) -> int:
@@ -178,59 +184,65 @@ def with_unit(table: Table, length_unit: str | None) -> Table:
     return replace(table, length_unit=length_unit, unit_given=True)
 
 
-def read_lines(path: Path) -> list[str]:
-    """Return the lines of a text file.
-
-    The encoding is UTF-16 if the file begins with that byte order mark, else UTF-8. If the bytes
-    are not valid UTF-8, it is Latin-1, which older programs write.
-
-    Raises:
-        InputError: no such file, or larger than a table may be.
-    """
-    content = read_bytes(path, FILE_LIMITS.table_bytes)
-    try:
-        marked = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-        text = content.decode("utf-16" if marked else "utf-8-sig")
-    except UnicodeDecodeError:
-        text = content.decode("latin-1")
-    return text.replace("\r\n", "\n").replace("\r", "\n").splitlines()
-
-
 def read_csv(path: Path) -> Table:
     """Read comma-separated values with one header row.
 
-    Empty lines and lines that begin with # are skipped. Empty cells after the last named column are
-    skipped, too, because some programs end every line with a comma.
+    Semicolons or tabs may separate the cells, with points or commas in the numbers; a notice
+    says so. Empty lines and lines that begin with # are skipped. Empty cells after the last named
+    column are skipped, too, because some programs end every line with a comma.
     """
-    lines = read_lines(path)
-    rows = [
-        (number, line.replace('"', "").split(","))
-        for number, line in enumerate(lines, 1)
+    lines = [
+        (number, line.replace('"', ""))
+        for number, line in enumerate(read_lines(path), 1)
         if line.strip() and not line.lstrip().startswith("#")
     ]
-    if not rows:
+    if not lines:
         raise InputError("is empty", path, "export the recording again")
+    # A header may contain commas, as in "Force, N"; a separator is in every line.
+    sign = next((one for one in (";", "\t") if all(one in line for _, line in lines)), ",")
+    rows = [(number, line.split(sign)) for number, line in lines]
+    rows, notices = (rows, ()) if sign == "," else _with_points(rows, sign, path)
     names = [name.strip() for name in rows[0][1]]
-    for sign, word in ((";", "semicolons"), ("\t", "tabs")):
-        if len(names) == 1 and sign in names[0]:
-            hint = "save it with commas between the cells and points in the numbers"
-            raise InputError(f"has {word} between its cells, not commas", path, hint)
     body = [
         (number, cells if any(map(str.strip, cells[len(names) :])) else cells[: len(names)])
         for number, cells in rows[1:]
     ]
     columns, equal = _columns(path, names, body)
-    return Table(path, columns, equal=equal, notices=_equal_notices(equal))
+    return Table(path, columns, equal=equal, notices=(*notices, *_equal_notices(equal)))
+
+
+def _with_points(
+    rows: list[tuple[int, list[str]]], sign: str, path: Path
+) -> tuple[list[tuple[int, list[str]]], tuple[str, ...]]:
+    """Return rows with points in the numbers, and a notice on the separator.
+
+    Raises:
+        InputError: some numbers have a comma and others a point.
+    """
+    cells = [cell.strip() for _, row in rows[1:] for cell in row]
+    comma = next((cell for cell in cells if _COMMA_NUMBER.fullmatch(cell)), None)
+    point = next((cell for cell in cells if "." in cell and _NUMBER.fullmatch(cell)), None)
+    if comma and point:
+        what = f"has numbers with a comma ('{comma}') and others with a point ('{point}')"
+        raise InputError(what, path, "export it with one decimal sign")
+    words = f"has {SEPARATORS[sign]} between its cells"
+    if not comma:
+        return rows, (f"{words}: read so",)
+    body = [(number, [cell.replace(",", ".") for cell in row]) for number, row in rows[1:]]
+    notice = f"{words} and commas in its numbers: read so, '{comma}' as {comma.replace(',', '.')}"
+    return [rows[0], *body], (notice,)
 
 
 def read_storage(path: Path) -> Table:
     """Read an OpenSim storage file: `key=value` lines, `endheader`, column names, rows."""
     lines = read_lines(path)
-    ends = [k for k, line in enumerate(lines) if line.strip().lower() == "endheader"]
+    ends = [k for k, line in enumerate(lines) if line.strip(' \t",;').lower() == "endheader"]
     if not ends:
         raise InputError(
             "has no 'endheader' line", path, "give an OpenSim storage file (.mot or .sto)"
         )
+    names = next((k for k in range(ends[0] + 1, len(lines)) if lines[k].strip()), len(lines))
+    lines, changes = tab_separated(lines, names)
     header = {}
     for line in lines[: ends[0]]:
         key, _, value = line.partition("=")
@@ -246,7 +258,8 @@ def read_storage(path: Path) -> Table:
         what = f"holds values of the type {header['datatype']}, not single numbers"
         raise InputError(what, path, "export it with DataType=double")
     columns, equal = _columns(path, rows[0][1], rows[1:])
-    notices = (*_equal_notices(equal), *_row_notices(header.get("nrows"), len(rows) - 1))
+    rows_stated = _row_notices(header.get("nrows"), len(rows) - 1)
+    notices = (*changes, *_equal_notices(equal), *rows_stated)
     degrees = STATED_DEGREES.get(header.get("indegrees", ""))
     return Table(path, columns, in_degrees=degrees, equal=equal, notices=notices)
 
@@ -264,13 +277,13 @@ def read_trc(path: Path) -> Table:
     A marker at exactly (0, 0, 0), an empty cell and NaN are gaps. Tabs separate the cells, or
     blanks in a line without tabs. Markers without a label get names like `marker 7`.
     """
-    lines = read_lines(path)
+    lines, changes = tab_separated(read_lines(path), TRC_LABELS)
     if len(lines) < 6 or not lines[0].startswith("PathFileType"):
         raise InputError("is not a .trc file: too short or no 'PathFileType' line", path)
     header = dict(zip(lines[1].split(), lines[2].split(), strict=False))
     body = [(number, _trc_cells(line)) for number, line in enumerate(lines[5:], 6) if line.strip()]
     usual = int(np.median([_filled(cells) for _, cells in body])) if body else 2
-    markers = _trc_labels(lines[3], lines[4], usual, path)
+    markers = _trc_labels(lines[TRC_LABELS], lines[4], usual, path)
     labels = [name or f"marker {k}" for k, name in enumerate(markers, 1)]
     columns = ["frame", "time", *(f"{m}_{axis}" for m in labels for axis in "xyz")]
     rows = []
@@ -286,7 +299,7 @@ def read_trc(path: Path) -> Table:
     frame = table.pop("frame")
     table["time"] = _exact_time(table["time"], frame, header.get("DataRate", ""))
     twice = sorted({name[:-2] for name in equal})
-    notices = [f"has two markers '{name}'; neither is used" for name in twice]
+    notices = changes + [f"has two markers '{name}'; neither is used" for name in twice]
     if unlabelled := markers.count(""):
         notices.append(f"has {unlabelled} marker(s) without a label; they are not used")
     notices += _row_notices(header.get("NumFrames"), len(rows))

@@ -4,7 +4,7 @@ The laboratory is x forward, y up, z to the subject's right. The tibia link's or
 ankle centre. A left shank is mirrored to a right one.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -70,6 +70,7 @@ class BodyMotion:
         residual: (f,) m, root mean square distance of the marker fit before filtering; None
             without a marker fit.
         odd: samples around the frames that lie off their neighbours' curve.
+        remarks: notices on the file.
     """
 
     time: Array
@@ -78,6 +79,7 @@ class BodyMotion:
     acceleration: Array
     residual: Array | None = None
     odd: tuple[OddSample, ...] = ()
+    remarks: tuple[str, ...] = ()
 
 
 def load_tibia(source: TibiaTable, time: Array, side: Side, cutoff_Hz: Cutoff) -> BodyMotion:
@@ -114,7 +116,7 @@ def load_tibia(source: TibiaTable, time: Array, side: Side, cutoff_Hz: Cutoff) -
     odd = _odd_poses(recorded, stamps, poses, time)
     filtered, velocity, acceleration = differentiate_poses(stamps, poses, cutoff, time, name)
     at_frames = None if residual is None else np.interp(time, stamps, residual)
-    return BodyMotion(time, filtered, velocity, acceleration, at_frames, odd)
+    return BodyMotion(time, filtered, velocity, acceleration, at_frames, odd, recorded.remarks)
 
 
 def _odd_poses(recorded: Table, stamps: Array, poses: Array, time: Array) -> tuple[OddSample, ...]:
@@ -168,7 +170,8 @@ def _sagittal(
     velocity, acceleration = np.zeros((len(time), 6)), np.zeros((len(time), 6))
     velocity[:, 5], acceleration[:, 5] = rate, rate_of_rate
     rotation = Rotation.from_euler("z", angle[:, None]).as_matrix()
-    return BodyMotion(time, pose(rotation, ankle), velocity, acceleration, odd=odd)
+    result = BodyMotion(time, pose(rotation, ankle), velocity, acceleration, odd=odd)
+    return replace(result, remarks=recorded.remarks)
 
 
 def _read_poses(source: TibiaTable, recorded: Table) -> Array:

@@ -63,6 +63,9 @@ _CHILDREN = {
 _MANY = {"visual", "collision"}
 _TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 _ANKLE_JOINT = "ankle"
+_AXIS_ROUNDING = 1e-6
+"""1: largest difference of a unit axis from its nominal axis that counts as rounding. Chosen as
+programs write six digits. The nominal axis replaces it."""
 
 
 @dataclass(frozen=True)
@@ -241,10 +244,17 @@ def _check_axes(
 ) -> None:
     """Raise an InputError unless each joint has its type and axis, and does not mimic another."""
     axes = {name: numbers_of(joints[name].find("axis"), "xyz", "1 0 0") for name in expected}
+    for name, (_, axis) in expected.items():
+        length = float(np.linalg.norm(axes[name]))
+        for nominal in (np.array(axis, float), -np.array(axis, float)):
+            if length > 0 and np.abs(axes[name] / length - nominal).max() <= _AXIS_ROUNDING:
+                axes[name] = nominal
+                if (element := joints[name].find("axis")) is not None:
+                    element.set("xyz", " ".join(f"{value:g}" for value in nominal))
     flipped = [
         name
         for name, (kind, axis) in expected.items()
-        if kind == "revolute" and np.allclose(axes[name], -np.array(axis), atol=1e-9)
+        if kind == "revolute" and np.array_equal(axes[name], -np.array(axis))
     ]
     if {"knee_axial_rotation", "knee_adduction"} <= set(flipped) and len(flipped) == 2:
         other = "left" if side == "right" else "right"
@@ -255,7 +265,7 @@ def _check_axes(
         )
     for name, (kind, axis) in expected.items():
         joint = joints[name]
-        if joint.get("type") != kind or not np.allclose(axes[name], axis, atol=1e-9):
+        if joint.get("type") != kind or not np.array_equal(axes[name], axis):
             about = " ".join(f"{value:g}" for value in axes[name])
             mirrored = "after mirroring " if side == "left" else ""
             raise InputError(
@@ -268,16 +278,17 @@ def _check_axes(
 
 
 def _check_limit(joint: ElementTree.Element, path: Path) -> None:
-    """Raise an InputError unless a joint states all limits, lower below upper.
+    """Raise an InputError unless a joint states all limits, lower not above upper.
 
-    tkamb does not use them, but parsers of URDF need them.
+    Equal limits are those of a joint that rests. tkamb does not use limits, but parsers of URDF
+    need them.
     """
     limit, name = joint.find("limit"), joint.get("name")
     if limit is None or not {"lower", "upper", "effort", "velocity"} <= set(limit.keys()):
         hint = "give lower, upper, effort and velocity"
         raise InputError(f"joint '{name}' has no complete <limit>", path, hint)
     low, high = (float(numbers_of(limit, key)[0]) for key in ("lower", "upper"))
-    if low >= high:
+    if low > high:
         raise InputError(f"joint '{name}' has limits {low:g} to {high:g}", path, "exchange them")
 
 

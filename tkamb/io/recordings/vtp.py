@@ -31,6 +31,9 @@ _TYPES = {"Float32": "f4", "Float64": "f8"} | {
     for sign, letter in (("", "i"), ("U", "u"))
     for bits in (8, 16, 32, 64)
 }
+MORE_THAN_STATED = "an array is larger than the number of points or polygons that is stated"
+COMPONENTS = 9
+"""1: largest number of values per point that is read: a tensor."""
 _SAVE_AGAIN = "save it again as ASCII .vtp, .stl or .ply"
 _RAW = re.compile(rb"<AppendedData[^>]*encoding=[\"']raw[\"'][^>]*>\s*_")
 
@@ -98,7 +101,9 @@ class _PolyData:
                 raise ValueError("it holds triangle strips")
             if int(piece.get("NumberOfPoints", -1)) == 0:
                 continue
-            corners = self._array(piece.find("Points/DataArray"), "points").reshape(-1, 3)
+            corners = self._array(
+                piece.find("Points/DataArray"), "points", 3 * int(piece.get("NumberOfPoints", 0))
+            ).reshape(-1, 3)
             if int(piece.get("NumberOfPoints", len(corners))) != len(corners):
                 raise ValueError("the number of points is not as stated")
             if int(piece.get("NumberOfPolys", 0)):
@@ -112,16 +117,19 @@ class _PolyData:
         result = []
         for piece in self._root.iter("Piece"):
             named = {array.get("Name"): array for array in piece.iterfind("PointData/DataArray")}
-            result.append(self._array(named.get(name), name).astype(float))
+            most = COMPONENTS * int(piece.get("NumberOfPoints", 0))
+            result.append(self._array(named.get(name), name, most).astype(float))
         return np.concatenate(result)
 
     def _polygons(self, piece: Element, points: Array) -> Indices:
         """Return the polygons of a piece as triangles (k, 3)."""
         named = {array.get("Name"): array for array in piece.iterfind("Polys/DataArray")}
-        index = self._array(named["connectivity"], "connectivity").astype(np.int64)
-        ends = self._array(named["offsets"], "offsets").astype(np.int64)
-        if len(ends) != int(piece.get("NumberOfPolys", 0)):
+        count = int(piece.get("NumberOfPolys", 0))
+        ends = self._array(named["offsets"], "offsets", count).astype(np.int64)
+        if len(ends) != count:
             raise ValueError("the number of polygons is not as stated")
+        most = max(int(ends[-1]), 0)
+        index = self._array(named["connectivity"], "connectivity", most).astype(np.int64)
         starts = np.concatenate([[0], ends[:-1]])
         if (ends < starts).any() or ends[-1] != len(index):
             raise ValueError("offsets and connectivity do not agree")
@@ -129,7 +137,8 @@ class _PolyData:
             raise ValueError("a polygon has a corner that is no point")
         return triangulated(points, index, ends)
 
-    def _array(self, array: Element | None, name: str) -> NDArray:
+    def _array(self, array: Element | None, name: str, most: int) -> NDArray:
+        """Return the values of an array; raise before more than `most` values are unpacked."""
         if array is None:
             raise KeyError(name)
         dtype = np.dtype(self._order + _TYPES[array.attrib["type"]])
@@ -146,13 +155,15 @@ class _PolyData:
         else:
             raise ValueError(f"unknown format '{form}'")
         raw = form == "appended" and self._raw
-        return np.frombuffer(self._decode(source, raw), dtype)
+        return np.frombuffer(self._decode(source, raw, most * dtype.itemsize), dtype)
 
-    def _decode(self, source: bytes, raw: bool) -> bytes:
+    def _decode(self, source: bytes, raw: bool, most: int) -> bytes:
         """Return the bytes of an array after its header."""
         size = self._header.itemsize
         if not self._compressed:
             header, remaining = self._decoded(source, size, raw)
+            if int(np.frombuffer(header, self._header)[0]) > most:
+                raise ValueError(MORE_THAN_STATED)
             return self._uncompressed(source, header, remaining, raw)
         header, _ = self._decoded(source, size, raw)
         count = int(np.frombuffer(header, self._header)[0])
@@ -160,8 +171,8 @@ class _PolyData:
         _, block_size, last_size, *sizes = (int(n) for n in np.frombuffer(header, self._header))
         if count == 0:
             return b""
-        if block_size * (count - 1) + (last_size or block_size) > FILE_LIMITS.mesh_bytes:
-            raise ValueError("a block unpacks to more bytes than it states")
+        if block_size * (count - 1) + (last_size or block_size) > most:
+            raise ValueError(MORE_THAN_STATED)
         packed, _ = self._decoded(remaining, sum(sizes), raw)
         blocks, start = [], 0
         for number, length in enumerate(sizes):

@@ -93,6 +93,13 @@ class Case:
         return differentiate_coordinates(time, places, cutoff, name="positions of the patella")
 
     @property
+    def remarks(self) -> tuple[str, ...]:
+        """Notices on the recordings: how they were read, and what of them is not used."""
+        parts = (self.motion, self.tibia, self.ground, self.measured, self.emg)
+        remarks = [remark for part in parts if part is not None for remark in part.remarks]
+        return tuple(dict.fromkeys(remarks))
+
+    @property
     def gait_cycle_s(self) -> tuple[float, float] | None:
         """Times of 0 and 100 % of the gait cycle, s, from the scene or else the force plates.
 
@@ -154,8 +161,6 @@ def _recordings(
         from tkamb.io.recordings.ground_reaction import check_under_foot, load_ground_reaction
 
         ground = load_ground_reaction(scene.ground_reaction, motion.time, scene.patient.side)
-        for notice in ground.notices:
-            logger.warning("%s: %s", scene.ground_reaction.file, notice)
         if tibia and scene.ground_reaction.applied == "cop":
             check_under_foot(ground, tibia.pose[:, :3, 3], scene.ground_reaction.file)
     return motion, tibia, ground

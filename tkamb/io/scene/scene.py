@@ -81,12 +81,6 @@ class Scene(SceneTable):
         return dict(self._overrides)
 
     @property
-    def identity_json(self) -> str:
-        """The scene as JSON, without the keys that only `tkamb wear` reads."""
-        unused = {"wear"} if self.material else {"wear", "material"}
-        return self.model_dump_json(exclude=unused)
-
-    @property
     def insert_material(self) -> dict[str, Any]:
         """Material of the insert, as argument of `tkamb.io.given_material`."""
         if self.material is not None:

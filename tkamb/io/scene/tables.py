@@ -224,17 +224,25 @@ class MusclesTable(SceneTable):
         "volume",
         description="w: optimal fibre length times strength, over its mean (volume), or 1 (equal)",
     )
-    reserve_Nm: Annotated[Number, Field(ge=0, le=10000)] | dict[str, Number] = Field(
-        10.0,
+    reserve_Nm: Annotated[Number, Field(ge=0, le=10000)] | dict[str, Number] | None = Field(
+        None,
         description="reserve moment that costs as much as one fully active muscle of weight 1: one "
-        "number for all balanced coordinates, or a table coordinate = number; 0: no reserve",
+        "number for all balanced coordinates, or a table coordinate = number; 0: no reserve; "
+        "default: 10 N·m at knee, ankle and subtalar joint, and no cost (10 kN·m) at the hip",
     )
     least_activation: Number = Field(
-        0.0,
+        0.0125,
         ge=0,
         le=0.2,
         description="lower bound of every muscle's activation, its resting tone. It loads the knee "
         "even without an external load",
+    )
+    least_condyle_share: Number = Field(
+        0.3,
+        ge=0,
+        le=0.45,
+        description="least share of each condyle in the load of the knee that the muscles keep, "
+        "see docs/muscles.md; 0: a condyle may lift off",
     )
     law: Literal["isometric", "hill"] = Field(
         "isometric",
@@ -393,6 +401,12 @@ class OutputTable(SceneTable):
     activity: Activity | None = Field(
         None,
         description="the report draws forces that instrumented knees measured in this activity",
+    )
+    licence: str | None = Field(
+        None,
+        max_length=200,
+        description="licence of the results, for the metadata of all files: an SPDX expression "
+        "such as CC-BY-4.0, or words",
     )
     notes: list[str] = Field(default_factory=list, description="printed in the report")
     answers: dict[str, str] = Field(

@@ -140,6 +140,11 @@ class UncertaintyTable(SceneTable):
         description="AP, SI and ML each: position of shank and knee relative to the ground "
         "reaction, in the tibia's axes" + _ASSUMED,
     )
+    frontal_alignment_deg: Angle = Field(
+        0.0,
+        description="the shank's angle in the frontal plane, about AP through the knee's centre, "
+        "relative to the laboratory; 0 by default: `tkamb import --register` estimates it",
+    )
     ground_reaction: Share = Field(0.02, description="relative, force and free moment" + _ASSUMED)
     centre_of_pressure_ap_mm: Length = Field(
         3.0,

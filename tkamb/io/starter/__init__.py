@@ -1,6 +1,7 @@
 """The command `tkamb new`, which writes a folder with a commented scene and its files."""
 
 import argparse
+import re
 import shutil
 import tempfile
 from importlib.resources import as_file, files
@@ -43,8 +44,16 @@ def lay_out(directory: Path, person: "Person | None" = None) -> Path:
                 write_person(copy, person)
             copy.replace(directory)  # This also replaces an empty folder of that name.
     except OSError as error:
-        raise InputError(f"cannot be written ({error.strerror})", directory) from None
+        reason = error.strerror or _reason_of_copy(error)
+        raise InputError(f"cannot be written ({reason})", directory) from None
     return directory / "scene.toml"
+
+
+def _reason_of_copy(error: OSError) -> str:
+    """Return the first reason of an error of `shutil.copytree`, which lists one per file."""
+    causes = error.args[0] if error.args else ()
+    texts = [str(cause[-1]) for cause in causes if isinstance(cause, tuple) and cause]
+    return re.sub(r"^\[Errno \d+\] |: '.*$", "", texts[0]) if texts else str(error)
 
 
 def add_new(commands: Any) -> None:

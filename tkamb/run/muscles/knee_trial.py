@@ -16,6 +16,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, inverse, transform
 from tkamb.io.importing.anatomy import Leg, find_leg
 from tkamb.io.importing.links import Links, find_links
+from tkamb.io.importing.markers import placed_markers
 from tkamb.io.importing.model_fit import fit_model
 from tkamb.io.opensim.kinematics import Kinematics
 from tkamb.io.opensim.motion import CoordinateMotion, coordinate_motion, read_coordinates
@@ -24,7 +25,14 @@ from tkamb.io.recordings.filtering import Cutoff
 from tkamb.io.recordings.ground_reaction import load_ground_reaction
 from tkamb.io.recordings.recording_tables import GroundReactionTable, Side
 from tkamb.io.recordings.tables import read_table
-from tkamb.run.muscles.leg import foot_loads, leg_bones, leg_muscles, muscle_groups
+from tkamb.knee.condyle_rows import CondyleRows
+from tkamb.run.muscles.leg import (
+    default_reserves,
+    foot_loads,
+    leg_bones,
+    leg_muscles,
+    muscle_groups,
+)
 from tkamb.run.muscles.sharing import FrameProblems, Sharing
 from tkamb.run.muscles.trial import Bones, trial_problems
 
@@ -85,7 +93,12 @@ class KneeTrial:
         )
 
     def solved(
-        self, k: int, moment: float, extensor_arm: float, arms: Array
+        self,
+        k: int,
+        moment: float,
+        extensor_arm: float,
+        arms: Array,
+        least: CondyleRows | None = None,
     ) -> tuple[FrameProblems, tuple[Array, Array, float, str]]:
         """Return the problem of frame k with the knee's row, and its solution.
 
@@ -96,6 +109,7 @@ class KneeTrial:
             moment: moment of muscles and reserve at the knee, N·m.
             extensor_arm: moment arm of the extensor group, m.
             arms: moment arms of the crossing muscles, m, (c,).
+            least: loads of the condyles that must not be negative; None: without.
         """
         problems, rows = self.problems, slice(k, k + 1)
         moments, table = problems.moment[rows].copy(), problems.arms[rows].copy()
@@ -113,8 +127,15 @@ class KneeTrial:
             active=problems.active[rows],
             passive=problems.passive[rows],
             guide=guide,
+            least=None if least is None else (least.constant, self._gain(least)),
         )
         return frame, frame.solved(0)
+
+    def _gain(self, rows: CondyleRows) -> Array:
+        """Return the changes (2, m) of the condyles' loads per newton of each muscle."""
+        gain = np.where(self.extensor, rows.extensor[:, None], 0.0)
+        gain[:, self.crossing] = rows.arms
+        return gain
 
     def force(self, k: int, activation: Array) -> Array:
         """Return the muscle forces (m,), N, in frame k at activations (m,)."""
@@ -208,6 +229,8 @@ class LegRecording:
             None: no implant.
         mesh_axes: axes of the mesh that point anterior, superior and right.
         sharing: options.
+        points: segment -> label -> position of a marker, m, (3,), where it differs from the
+            model's, see `placed_markers`.
     """
 
     model: Path
@@ -220,6 +243,7 @@ class LegRecording:
     insert_placement: Array | None
     mesh_axes: str
     sharing: Sharing
+    points: Mapping[str, Mapping[str, Array]] = field(default_factory=dict)
 
 
 def load_knee_trial(source: LegRecording, time: Array) -> tuple[Links, KneeTrial]:
@@ -233,15 +257,17 @@ def load_knee_trial(source: LegRecording, time: Array) -> tuple[Links, KneeTrial
         InputError: a file or an option cannot be used.
     """
     leg = _read_leg(source.model, source.side)
-    model = leg.model
     links = find_links(leg, source.insert_placement, source.mesh_axes, {}, False)
-    motion = _motion(source, Kinematics(model), time)
+    motion = _motion(source, Kinematics(placed_markers(links, source.points)), time)
     loads = {}
     if source.ground is not None:
         # "right" means no mirroring: the model has the leg of the recorded side
         reaction = load_ground_reaction(source.ground, time, "right")
-        loads = foot_loads(model, {source.side: reaction})
-    return links, knee_trial(links, motion, loads, source.sharing)
+        loads = foot_loads(leg.model, {source.side: reaction})
+    sharing = source.sharing
+    if sharing.reserve is None:
+        sharing = replace(sharing, reserve=default_reserves(leg))
+    return links, knee_trial(links, motion, loads, sharing)
 
 
 def group_names(model: Path, side: Side) -> tuple[str, ...]:
@@ -262,9 +288,11 @@ def _read_leg(path: Path, side: Side) -> Leg:
     """Return a leg of a model.
 
     Raises:
-        InputError: a joint or constraint of the model, or a muscle of the leg, cannot be read.
+        InputError: the model has no gravity, or a joint or constraint of the model, or a muscle of
+            the leg, cannot be read.
     """
     leg = find_leg(read_osim(path, partial=True), side)
+    leg.model.check_gravity()
     bodies = {body for group in leg_bones(leg).values() for body in group}
     for one in leg.model.unread:
         if one.constrains or (one.concerns & bodies and one.kind != "Marker"):

@@ -156,6 +156,31 @@ def leg_coordinates(leg: Leg) -> tuple[str, ...]:
     return (*free(leg.hip), leg.flexion, *free(leg.ankle), *(c for j in below for c in free(j)))
 
 
+@dataclass(frozen=True)
+class ReserveSettings:
+    """Reserve moments of a leg in a scene with [muscles]."""
+
+    at_hip: float = 1e4
+    """N·m: size of the reserve of the hip's coordinates, so large that it costs nothing. Chosen
+    because the abductors of scaled models are too weak for the moments of inverse dynamics. With
+    10 N·m the muscles that cross hip and knee supply them, and the knee's load is too large
+    (docs/truth.md)."""
+    elsewhere: float = 10.0
+    """N·m: size at knee, ankle and subtalar joint, as usual in static optimisation."""
+
+
+RESERVE = ReserveSettings()
+
+
+def default_reserves(leg: Leg) -> dict[str, float]:
+    """Return coordinate -> size of its reserve, N·m, for the balanced coordinates of a leg."""
+    coordinates = leg.model.coordinates
+    return {
+        name: RESERVE.at_hip if coordinates[name].joint == leg.hip.name else RESERVE.elsewhere
+        for name in leg_coordinates(leg)
+    }
+
+
 def leg_muscles(leg: Leg) -> tuple[str, ...]:
     """Return the enabled muscles with a path point on a leg, without twins (`length_twins`)."""
     bodies = {body for group in leg_bones(leg).values() for body in group}

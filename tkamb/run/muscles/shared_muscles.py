@@ -5,6 +5,7 @@ of the knee provide the row of its flexion (`tkamb.knee.crossing`). The tension 
 group is therefore the same in the optimisation and in the equations of the knee.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from tkamb.errors import ComputationError, InputError, names_near
 from tkamb.geometry.frames import MIRROR, Array, mirrored_pose
 from tkamb.io.scene.case import Case
 from tkamb.io.scene.tables import MusclesTable
+from tkamb.knee.condyle_rows import condyle_rows
 from tkamb.knee.crossing import (
     CrossingLines,
     FlexionRow,
@@ -108,12 +110,21 @@ class FrameMuscles:
             lifted: sides without contact force.
         """
         try:
-            return self._shared(flexion_row(geometry, self.lines, friction, lifted))
+            row = flexion_row(geometry, self.lines, friction, lifted)
+            points = {side: one.point for side, one in geometry.condyles.items()}
+            share = self._shared(row, geometry, points if len(points) == 2 and not lifted else {})
         except ComputationError as error:
             return self._failed(f"failed: {error.what}")
+        if lifted > geometry.lifted and self.trial.problems.sharing.least_share > 0.0:
+            return replace(share, both_loaded=False)
+        return share
 
     def share_of_yielding_knee(
-        self, geometry: KneeGeometry, base: float, per_wrench: Array
+        self,
+        geometry: KneeGeometry,
+        base: float,
+        per_wrench: Array,
+        points: Mapping[str, Array] | None = None,
     ) -> MuscleShare:
         """Return the force of each muscle if the knee's released coordinates depend on the forces.
 
@@ -121,12 +132,13 @@ class FrameMuscles:
             geometry: geometry of the knee. Its contact is not used.
             base: tension of the patellar ligament, N, see `yielding_flexion_row`.
             per_wrench: change of this tension by a wrench on the insert, (6,).
+            points: side -> contact point (3,), m, of each condyle in contact; None: unknown.
         """
         try:
             row = yielding_flexion_row(geometry, self.lines, base, per_wrench)
         except ComputationError as error:
             return self._failed(f"failed: {error.what}")
-        return self._shared(row)
+        return self._shared(row, geometry, points or {})
 
     def at(self, share: MuscleShare) -> MuscleShare:
         """Return muscle forces of another frame along the lines of this frame."""
@@ -154,15 +166,26 @@ class FrameMuscles:
             lifted = loads.lifted
         return geometry, unsolved(["the iteration of muscles and load state does not converge"])
 
-    def _shared(self, row: FlexionRow) -> MuscleShare:
-        trial, k = self.trial, self.k
-        problem, (activation, reserve, _, status) = trial.solved(
-            k, row.moment, row.extensor_arm, row.arms
-        )
+    def _shared(
+        self, row: FlexionRow, geometry: KneeGeometry, points: Mapping[str, Array]
+    ) -> MuscleShare:
+        """Return the forces that keep the least share on each condyle or, if none do, all forces.
+
+        `points` are the contact points of the condyles; without any, the share is not required.
+        """
+        trial, k, required = self.trial, self.k, self.trial.problems.sharing.least_share
+        rows = condyle_rows(geometry, self.lines, points) if required > 0.0 else None
+        least = None if rows is None else rows.above_share(required)
+        knee = (k, row.moment, row.extensor_arm, row.arms)
+        problem, (activation, reserve, _, status) = trial.solved(*knee, least)
+        both_loaded = status == "ok"
+        if least is not None and not both_loaded:
+            problem, (activation, reserve, _, status) = trial.solved(*knee)
         if status != "ok":
             return self._failed(status)
         force = trial.force(k, activation)
-        return self._share(activation, force, problem.moment[0], reserve, "ok")
+        share = self._share(activation, force, problem.moment[0], reserve, "ok")
+        return replace(share, both_loaded=both_loaded)
 
     def _failed(self, status: str) -> MuscleShare:
         forces = np.full(len(self.trial.muscles), np.nan)
@@ -194,6 +217,7 @@ def sharing_of(table: MusclesTable) -> Sharing:
         exponent=table.exponent,
         weights=table.weights,
         lowest=table.least_activation,
+        least_share=table.least_condyle_share,
         law=table.law,
     )
 
@@ -224,6 +248,12 @@ def load_muscles(case: Case) -> SharedMuscles:
         insert_placement=case.insert_placement,
         mesh_axes="+x,+y,+z" if insert is None else insert.axes,
         sharing=sharing_of(table),
+        points={
+            segment.name: {
+                label: np.array(place) * MILLIMETRE for label, place in segment.markers_mm.items()
+            }
+            for segment in (markers.segment if markers else ())
+        },
     )
     links, trial = load_knee_trial(source, case.motion.time)
     _check_links(case, links.insert_in_tibia, links.hip)

@@ -313,29 +313,34 @@ class Sharing:
     Args:
         muscles: names of the muscles; None: the result of `leg_muscles`.
         coordinates: names of the balanced coordinates; None: hip, knee flexion, ankle, subtalar.
-        reserve: r, N·m (N for a translation), for all coordinates or by name. A reserve of this
+        reserve: r, N·m (N for a translation), for all coordinates or by name; None: those of
+            `tkamb.run.muscles.leg.default_reserves`. A reserve of this
             size costs as much as one fully active muscle of weight 1. inf: no cost, 0: no reserve.
         exponent: p, at least 2.
         weights: "volume" (optimal fibre length times strength, relative to the mean) or "equal".
         lowest: least activation.
         highest: largest activation.
+        least_share: least share of each condyle in the load of the knee, see
+            `tkamb.knee.condyle_rows`; 0: a condyle may lift off. Only for tkamb's own knee.
         law: "isometric" (F_i is the maximal isometric force, without passive force) or "hill", see
             `rigid_tendon_strength`.
     """
 
     muscles: tuple[str, ...] | None = None
     coordinates: tuple[str, ...] | None = None
-    reserve: float | Mapping[str, float] = 10.0
+    reserve: float | Mapping[str, float] | None = 10.0
     exponent: float = 2.0
     weights: Literal["volume", "equal"] = "volume"
     lowest: float = 0.0
     highest: float = 1.0
+    least_share: float = 0.0
     law: Literal["isometric", "hill"] = "isometric"
 
     def reserves(self, coordinates: Sequence[str]) -> Array:
         """Return r (c,) of c coordinates."""
         if isinstance(self.reserve, Mapping):
             return np.array([float(self.reserve[name]) for name in coordinates])
+        assert self.reserve is not None
         return np.full(len(coordinates), float(self.reserve))
 
     def check(self, coordinates: Sequence[str]) -> None:
@@ -366,6 +371,8 @@ class FrameProblems:
         active: forces at full activation without the passive forces, N, (f, m).
         passive: passive forces, N, (f, m).
         guide: guidance by EMG; None: without.
+        least: offset (r,) N and gain (r, m) of r sums of muscle forces that must not be negative;
+            None: without.
     """
 
     muscles: list[OpenSimMuscle]
@@ -376,6 +383,7 @@ class FrameProblems:
     active: Array
     passive: Array
     guide: EmgGuide | None = None
+    least: tuple[Array, Array] | None = None
 
     def solved(self, k: int) -> tuple[Array, Array, float, str]:
         """Return activations (m,), reserves (c,), KKT residual and status of frame k."""
@@ -387,7 +395,8 @@ class FrameProblems:
                 reason = error.what
             else:
                 if shared.kkt_residual < SHARING.kkt_tolerance:
-                    return shared.activation, shared.others, shared.kkt_residual, "ok"
+                    others = shared.others[: len(self.coordinates)]
+                    return shared.activation, others, shared.kkt_residual, "ok"
                 reason = f"the conditions of the optimum are violated by {shared.kkt_residual:.1g}"
         missing = np.full(len(self.muscles), np.nan), np.full(len(self.coordinates), np.nan)
         return *missing, np.nan, f"failed: {reason}"
@@ -424,7 +433,22 @@ class FrameProblems:
             reserve=np.where(none, np.inf, reserve),
             exponent=self.sharing.exponent,
         )
-        return problem if self.guide is None else self.guide.applied(problem, k)
+        problem = problem if self.guide is None else self.guide.applied(problem, k)
+        return problem if self.least is None else self._above_least(problem, k)
+
+    def _above_least(self, problem: LoadSharing, k: int) -> LoadSharing:
+        """Return the problem with the sums of `least` as further y, without cost."""
+        assert self.least is not None
+        offset, gain = self.least
+        without = np.full(len(offset), np.inf)
+        return replace(
+            problem,
+            offset=np.concatenate([problem.offset, offset + gain @ self.passive[k]]),
+            gain=np.vstack([problem.gain, gain * self.active[k]]),
+            lower=np.concatenate([problem.lower, np.zeros(len(offset))]),
+            upper=np.concatenate([problem.upper, without]),
+            reserve=np.concatenate([problem.reserve, without]),
+        )
 
 
 def _weights(muscles: Sequence[OpenSimMuscle], sharing: Sharing) -> Array:

@@ -55,7 +55,7 @@ function show(frame) {
   slider.value = frame;
   const status = data.status[frame] === "ok" ? "" : ", " + data.status[frame].replaceAll("_", " ");
   const place = document.getElementById("place");
-  place.textContent = place.title = `${frame}: ${data.place[frame]}${status}`;
+  place.textContent = place.title = `${data.frames[frame]}: ${data.place[frame]}${status}`;
   for (const plot of plots) {
     const at = plot.place(data.x[frame]);
     plot.line.setAttribute("x1", at);

@@ -1,12 +1,14 @@
 """Drawing of a run: bodies of the scene, forces and numbers of results.csv, pressure maps."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.geometry.frames import SIDES, Array
+from tkamb.geometry.frames import SIDES, Array, Mask
 from tkamb.io.scene.case import Case
+from tkamb.run.claims import split_of
 from tkamb.run.metrics import body_weight, map_rows, medial_share
 from tkamb.show.axis import HorizontalAxis, horizontal_axis
 from tkamb.show.headline import run_title
@@ -99,10 +101,10 @@ def _pressure_map(results: "Results", rows: list[int]) -> PressureMap | None:
         return None
     missing = np.full(len(maps.points_m), np.nan)
     pressure, gap = (
-        np.stack([stored[row] if row >= 0 else missing for row in rows])
-        for stored in (maps.pressure_Pa / MEGAPASCAL, maps.gap_m)
+        np.stack([maps.rows(name, [row])[0] if row >= 0 else missing for row in rows])
+        for name in ("pressure_Pa", "gap_m")
     )
-    return PressureMap(maps.points_m, maps.triangles, pressure, gap)
+    return PressureMap(maps.points_m, maps.triangles, pressure / MEGAPASCAL, gap)
 
 
 def lattice_lines(case: Case) -> Array:
@@ -151,10 +153,7 @@ def readings(results: "Results", axis: HorizontalAxis) -> tuple[Reading, ...]:
         _reading("adduction", _direction("varus", "valgus"), results["adduction_deg"]),
         _reading("axial rotation", _direction("ext.", "int."), results["axial_rotation_deg"]),
         force("contact force", results["force_total_N"]),
-        both("· by deformation", "force_N", " BW", 2, 1.0 / weight),
-        both("· by equilibrium", "force_equilibrium_N", " BW", 2, 1.0 / weight),
-        number("· medial share, deform.", 100 * medial_share(results, "deformation"), " %"),
-        number("· medial share, equil.", 100 * medial_share(results, "equilibrium"), " %"),
+        *_split_readings(results, both, number),
         both("peak pressure", "peak_pressure_MPa", " MPa", 1),
         both("contact area", "area_mm2", " mm²"),
         force("quadriceps", results["quadriceps_N"]),
@@ -164,6 +163,37 @@ def readings(results: "Results", axis: HorizontalAxis) -> tuple[Reading, ...]:
         force("ground reaction", _magnitude(results, "ground_reaction")),
     ]
     return tuple(row for row in rows if any(value != "–" for value in row.values))
+
+
+def _split_readings(
+    results: "Results", both: Callable[..., Reading], number: Callable[..., Reading]
+) -> list[Reading]:
+    """Return forces and medial share by each estimate, the one that the run may state first.
+
+    Numbers by deformation carry "?" in frames in which adduction does not determine them.
+    """
+    split, weight = split_of(results.columns), body_weight(results)
+    names = {"equilibrium": "force_equilibrium_N", "deformation": "force_N"}
+    short = {"equilibrium": "equil.", "deformation": "deform."}
+    rows = []
+    for estimate in sorted(names, key=lambda name: name != split.estimate):
+        pair = [
+            both(f"· by {estimate}", names[estimate], " BW", 2, 1.0 / weight),
+            number(
+                f"· medial share, {short[estimate]}", 100 * medial_share(results, estimate), " %"
+            ),
+        ]
+        if estimate == "deformation":
+            pair = [replace(row, values=_doubted(row.values, split.undetermined)) for row in pair]
+        rows += pair
+    return rows
+
+
+def _doubted(values: Sequence[str], doubtful: Mask) -> tuple[str, ...]:
+    return tuple(
+        f"{text} ?" if doubt and text != "–" else text
+        for text, doubt in zip(values, doubtful, strict=True)
+    )
 
 
 def frame_labels(axis: HorizontalAxis) -> tuple[str, ...]:

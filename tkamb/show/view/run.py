@@ -155,7 +155,7 @@ def read_source(path: str | Path, contact: str | None = None) -> Source:
     folder = scene.output.directory or Path("out") / path.resolve().parent.name
     if os.path.exists(folder / SUMMARY_NAME):
         results = read_results(folder)
-        same = results.summary.get("scene_sha256") == scene_hash(case)
+        same = results.summary.get("scene_sha256") == scene_hash(case.scene)
         same = same and same_files(case, results.summary)
         if same and len(results) and not results.summary.get("unfinished_frames"):
             return Source(path, case, results, folder)

@@ -12,7 +12,7 @@ from tkamb.geometry.frames import Array
 from tkamb.geometry.memory import give_back
 from tkamb.run.columns import KINDS
 from tkamb.run.metrics import lateral_axis_name, map_rows
-from tkamb.run.recorder import ANY, Shard, have
+from tkamb.run.recorder import Shard
 from tkamb.run.results import Results
 from tkamb.run.simulation import simulate
 from tkamb.run.status import FAILED
@@ -109,44 +109,6 @@ class Outcome:
         return cls(row["reason"], columns, row["status"], chosen, row["wear"], row["wear_problem"])
 
 
-ROW_KINDS = {"reason": str, "status": list, "wear": dict, "wear_problem": str}
-MAP_KINDS = {"frame": int, "side": str, "lateral": str}
-
-
-def is_outcome(shard: Shard) -> bool:
-    """Return whether a stored shard has the names, types and shapes that `Outcome.of` needs."""
-    row, arrays = shard.row, shard.contact or {}
-    has_map = "points" in arrays
-    kinds = ROW_KINDS | (MAP_KINDS if has_map else {})
-    if {name: type(value) for name, value in row.items()} != kinds:
-        return False
-    texts = all(isinstance(status, str) for status in row["status"])
-    wear = all(type(value) in (int, float) for value in row["wear"].values())
-    frames = len(row["status"])
-    expected: dict[str, tuple[str, tuple[int, ...]]] = {
-        name: ("fiub", (frames,)) for name in arrays if name.startswith("column ")
-    }
-    if has_map:
-        points = len(arrays["points"])
-        expected |= {"points": ("f", (points, 3)), "pressure": ("f", (points,))}
-        expected["triangles"] = ("iu", (ANY, 3))
-    if not (texts and wear and have(arrays, expected)):
-        return False
-    if bool(row["reason"]) == bool(expected):  # a run has either a reason or columns
-        return False
-    if expected and not np.isfinite(arrays.get("column time_s", np.nan)).all():
-        return False
-    return not has_map or _is_map(row, arrays)
-
-
-def _is_map(row: Mapping[str, Any], arrays: Mapping[str, Array]) -> bool:
-    triangles, sides = arrays["triangles"], (row["side"], row["lateral"])
-    inside = not len(triangles) or 0 <= triangles.min() <= triangles.max() < len(arrays["points"])
-    known = sides[0] in ("right", "left") and sides[1] in ("lateral", "medial")
-    finite = all(np.isfinite(arrays[name]).all() for name in ("points", "pressure"))
-    return bool(inside and known and finite and 0 <= row["frame"] < len(row["status"]))
-
-
 class CohortWorker:
     """Computes runs of a cohort.
 
@@ -232,7 +194,7 @@ def chosen_map(results: Results, flexion: float | None) -> PressureMap | None:
         frame,
         results.maps.points_m,
         results.maps.triangles,
-        results.maps.pressure_Pa[rows[frame]],
+        results.maps.rows("pressure_Pa", [rows[frame]])[0],
         str(results.summary.get("side", "right")),
         lateral_axis_name(results),
     )

@@ -24,7 +24,7 @@ from tkamb.io.recordings.scene_table import Count, Number, SceneTable
 from tkamb.io.scene import Scene, load_scene
 from tkamb.io.toml_text import read_toml
 from tkamb.run.frame_choice import frames_slice
-from tkamb.run.identity import files_in
+from tkamb.run.identity import files_in, scene_hash
 
 AXES = ("subject", "trial", "design", "contact")
 GROUP_AXES = ("activity", *AXES[1:])
@@ -176,8 +176,8 @@ class CohortRun:
 
     @cached_property
     def scene_hash(self) -> str:
-        """Return the SHA-256 of the validated scene."""
-        return hashlib.sha256(self.scene.identity_json.encode()).hexdigest()
+        """Return the SHA-256 of the scene and its files, as in summary.json."""
+        return scene_hash(self.scene)
 
     def words(self) -> str:
         """Return the labels in one line."""

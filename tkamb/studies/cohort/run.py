@@ -27,7 +27,7 @@ from tkamb.run.recorder import Shards
 from tkamb.run.results import page
 from tkamb.run.results_folder import remove_shards
 from tkamb.run.workers import PoolOptions, Progress, Task
-from tkamb.studies.cohort.outcome import CohortWorker, Outcome, is_outcome
+from tkamb.studies.cohort.outcome import CohortWorker, Outcome
 from tkamb.studies.cohort.plan import GROUP_AXES, Cohort, CohortRun, load_cohort
 from tkamb.studies.cohort.statistics import group_rows, groups_of
 
@@ -285,7 +285,7 @@ def _stored(folders: list[Shards], numbers: list[int]) -> dict[int, Outcome]:
     result: dict[int, Outcome] = {}
     for shards in folders:
         for number in numbers if shards.resumed else ():
-            shard = shards.get(number, is_outcome)
-            if shard is not None:
-                result[number] = Outcome.of(shard)
+            outcome = shards.read(number, Outcome.of)
+            if outcome is not None:
+                result[number] = outcome
     return result

@@ -169,40 +169,6 @@ def discrepancy_columns(
     return columns
 
 
-def peak_bands(
-    columns: Mapping[str, Any],
-    bands: Mapping[str, Array],
-    compared: Mapping[str, str],
-    body_weight: float,
-) -> dict[str, dict[str, Any]]:
-    """Return the nominal peak of each force and its bands at that frame, in body weights.
-
-    Args:
-        columns: columns of results.csv.
-        bands: columns of bands.csv.
-        compared: force -> column of results.csv, N.
-        body_weight: body weight, N.
-
-    Returns:
-        Force -> frame, nominal, median, p05, p95, discrepancy_p05 and discrepancy_p95. Limits
-        without a band are None.
-    """
-    rows: dict[str, dict[str, Any]] = {}
-    for force, name in compared.items():
-        if not np.isfinite(columns[name]).any():
-            continue
-        frame = int(np.nanargmax(columns[name]))
-        row: dict[str, Any] = {"frame": frame, "nominal": float(columns[name][frame]) / body_weight}
-        ends = {"median": "p50"} | {end: end for end in ENDS}
-        ends |= {f"discrepancy_{end}": f"discrepancy_{end}" for end in ENDS}
-        for key, ending in ends.items():
-            band = bands.get(f"{name}_{ending}")
-            has_band = band is not None and np.isfinite(band[frame])
-            row[key] = float(band[frame]) / body_weight if has_band and band is not None else None
-        rows[force] = row
-    return rows
-
-
 def causes(problems: np.ndarray) -> dict[str, float]:
     """Return cause -> its share of the failed frames, for the most frequent causes.
 

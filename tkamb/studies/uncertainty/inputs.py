@@ -124,6 +124,8 @@ def _load_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
                 inputs.append(VariedInput(name, getattr(table, f"{name}_mm"), "mm"))
             if case.tibia is not None:
                 inputs += _places("knee_centre", AXES, table.knee_centre_mm)
+                tilt = table.frontal_alignment_deg
+                inputs.append(VariedInput("frontal_alignment", tilt, "deg"))
     if case.scene.contact is not None:
         inputs.append(VariedInput("friction", table.friction, "1"))
         inputs.append(VariedInput("young_modulus", table.young_modulus, "relative"))

@@ -20,10 +20,10 @@ from tkamb.io.claim import claimed_directory
 from tkamb.io.hdf5_file import new_hdf5
 from tkamb.io.scene import Scene, load_scene
 from tkamb.io.scene.case import Case, load_case
+from tkamb.run.claims import peaks
 from tkamb.run.columns import KINDS
 from tkamb.run.guard import interrupt_as_such
-from tkamb.run.recorded import predicted_columns
-from tkamb.run.recorder import Shard, Shards, have
+from tkamb.run.recorder import Shard, Shards
 from tkamb.run.results import STATISTICS_LIMITS, Results
 from tkamb.run.results_folder import (
     BANDS_NAME,
@@ -42,7 +42,6 @@ from tkamb.studies.uncertainty.bands import (
     influences,
     measured_inside,
     peak_band,
-    peak_bands,
 )
 from tkamb.studies.uncertainty.inputs import VariedInput, held_inputs, uncertainty_of, varied_inputs
 from tkamb.studies.uncertainty.sample import BandWorker, Sample
@@ -186,7 +185,7 @@ def estimate_uncertainty(
         scene: scene, or the path of its file.
         samples: number of samples, at least 20.
         workers: number of processes; 1: compute in this process.
-        dask: address of a Dask scheduler, or "local" for a scheduler on this computer with
+        dask: address of a Dask scheduler, or "local" for worker processes on this computer,
             `workers` processes.
         method: "lhs" or "sobol", see `tkamb.studies.uncertainty.sampling`.
         indices: whether to compute Sobol' indices with Saltelli's design. With d inputs
@@ -283,8 +282,7 @@ class _Job:
         """Compute the samples that are not stored yet and return the result of all samples."""
         names = banded_names(self.nominal)
         count = len(self.points)
-        shape = (len(names), len(self.nominal), len(self.inputs))
-        samples = _stored(shards, count, shape)
+        samples = _stored(shards, count)
         remaining = [n for n in range(count) if n not in samples]
         new = self.team.answers([(n, (self.points[n], names)) for n in remaining])
         try:
@@ -322,9 +320,7 @@ class _Job:
         if PEAK in names:
             peak = peak_band(self.nominal[PEAK], values[:, names.index(PEAK)], failed)
             summary["uncertainty"]["peak_force_total_BW"] = peak
-        summary["uncertainty"]["peaks_BW"] = peak_bands(
-            self.nominal.columns, bands, predicted_columns(self.nominal.columns), weight
-        )
+        summary["uncertainty"]["peaks_BW"] = peaks(self.nominal.columns, bands, weight)
         if summary.get("measured"):
             inside = measured_inside(self.nominal.columns, bands, summary["measured"])
             summary["uncertainty"]["measured_inside"] = inside
@@ -366,22 +362,12 @@ def banded_names(results: Results) -> list[str]:
     ]
 
 
-def _stored(shards: Shards | None, count: int, shape: tuple[int, int, int]) -> dict[int, Sample]:
+def _stored(shards: Shards | None, count: int) -> dict[int, Sample]:
     samples: dict[int, Sample] = {}
     if shards is None or not shards.resumed:
         return samples
     for number in range(count):
-        shard = shards.get(number, lambda stored: _is_sample(stored.contact or {}, shape))
-        if shard is not None and shard.contact is not None:
-            samples[number] = Sample(**shard.contact)
+        sample = shards.read(number, lambda shard: Sample(**(shard.contact or {})))
+        if sample is not None:
+            samples[number] = sample
     return samples
-
-
-def _is_sample(arrays: Mapping[str, Array], shape: tuple[int, int, int]) -> bool:
-    names, frames, inputs = shape
-    expected = {
-        "values": ("f", (names, frames)),
-        "problems": ("U", (frames,)),
-        "errors": ("f", (frames, inputs)),
-    }
-    return have(arrays, expected) and bool(np.isfinite(arrays["errors"]).all())

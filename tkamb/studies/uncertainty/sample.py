@@ -25,6 +25,7 @@ from tkamb.geometry.frames import (
     inverse,
     knee_coordinates,
     knee_pose,
+    pose,
 )
 from tkamb.io.recordings.markers import fit_seen
 from tkamb.io.recordings.recording_tables import MarkerSegmentTable
@@ -71,9 +72,7 @@ def varied_case(case: Case, draw: Draw) -> Case:
     varied = replace(case, tibia=tibia, motion=replace(case.motion, coordinates=coordinates))
     changes: dict[str, Any] = {"motion": _motion(varied, draw), "scene": _scene(case, draw)}
     if tibia is not None:
-        pose = tibia.pose.copy()
-        pose[:, :3, 3] += tibia.pose[:, :3, :3] @ draw.place("knee_centre")
-        changes["tibia"] = replace(tibia, pose=pose)
+        changes["tibia"] = replace(tibia, pose=tibia.pose @ _shank_error(case, draw))
     if case.ground is not None:
         changes["ground"] = _ground(case.ground, draw)
     changes["chain"] = case.chain.changed(
@@ -89,6 +88,16 @@ def varied_case(case: Case, draw: Draw) -> Case:
         wrap = _wrap(case.patellar_ligament.wrap, PATELLAR_LIGAMENT, draw)
         changes["patellar_ligament"] = replace(case.patellar_ligament, distal=distal, wrap=wrap)
     return replace(case, **changes)
+
+
+def _shank_error(case: Case, draw: Draw) -> Array:
+    """Return the pose (4, 4) of the erroneous shank in the nominal one.
+
+    The shank turns about AP through the knee's centre, the origin of the insert, and moves.
+    """
+    tilt, centre = draw.error("frontal_alignment"), case.chain.insert_in_tibia[:3, 3]
+    rotation = Rotation.from_rotvec([tilt, 0.0, 0.0]).as_matrix()
+    return pose(rotation, centre - rotation @ centre + draw.place("knee_centre"))
 
 
 def _scene(case: Case, draw: Draw) -> Scene:

@@ -16,7 +16,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_coordinates, knee_pose
 from tkamb.io.scene.uncertainty import UncertaintyTable
 from tkamb.run.guard import interrupt_as_such
-from tkamb.run.recorder import Shard, Shards, have
+from tkamb.run.recorder import Shard, Shards
 from tkamb.run.results import STATISTICS_LIMITS
 from tkamb.run.workers import Numbered, PoolOptions, Task
 from tkamb.studies.uncertainty.bands import percentiles
@@ -288,7 +288,7 @@ class Sampling:
         normal = normal_samples("lhs", count, len(self.inputs), self.seed) @ self.root.T
         done: dict[int, Rows] = {}
         for n in range(count) if shards and shards.resumed else ():
-            if shards and (shard := shards.get(n, _is_sample)):
+            if shards and (shard := shards.get(n)):
                 done[n] = shard.contact or {}
         remaining = [(n, normal[n]) for n in range(count) if n not in done]
         task = Task(WearSampler, (simulation, self.inputs, self.constant_share))
@@ -306,18 +306,6 @@ class Sampling:
             what = f"{len(done)} of {count} samples are kept; go on with resume=True"
             raise KeyboardInterrupt(what) from None
         return _bands(self.inputs, [done[n] for n in range(count)], rows, simulation[1])
-
-
-def _is_sample(shard: Shard) -> bool:
-    columns = shard.contact or {}
-    if not columns:
-        return True
-    rows = columns["cycles"].size if "cycles" in columns else 0
-    if not rows or not have(columns, dict.fromkeys(("cycles", *BANDED), ("f", (rows,)))):
-        return False
-    cycles = columns["cycles"]
-    finite = np.isfinite(cycles).all() and np.isfinite(columns["volume_mm3"]).all()
-    return bool(finite and (np.diff(cycles) >= 0).all())
 
 
 def _bands(

@@ -307,7 +307,7 @@ class WearReport:
             write_triangles(files.path("wear.vtp"), surface.vertices, surface.faces, maps)
             in_mm = trimesh.Trimesh(surface.vertices / MILLIMETRE, surface.faces, process=False)
             in_mm.export(files.path("worn_insert.stl"), file_type="stl")
-            draw_wear(surface, maps, self._rows(), files.path("wear.png"))
+            draw_wear(surface, maps, self._rows(), files.path("wear.png"), self.setup.side)
             files.remove(STATE_NAME)
         remove_shards(folder, SAMPLES_NAME)
 
@@ -358,7 +358,11 @@ LABELS = {
 
 
 def draw_wear(
-    surface: Surface, maps: dict[str, Array], rows: Sequence[Mapping[str, float]], path: Path
+    surface: Surface,
+    maps: dict[str, Array],
+    rows: Sequence[Mapping[str, float]],
+    path: Path,
+    side: str,
 ) -> None:
     """Draw the maps of the insert in a superior view, anterior at the top and right on the right.
 
@@ -369,13 +373,16 @@ def draw_wear(
         maps: name -> values at the vertices.
         rows: rows of the table.
         path: PNG file to write.
+        side: "right" or "left" knee.
     """
     from matplotlib.figure import Figure
 
     facing = surface.face_normals[:, 1] > 0
     x, z = surface.vertices[:, 0] / MILLIMETRE, surface.vertices[:, 2] / MILLIMETRE
     columns = (len(maps) + 2) // 2
+    ends = ("medial", "lateral") if side == "right" else ("lateral", "medial")
     figure = Figure(figsize=(5.5 * columns, 8), layout="constrained")
+    figure.suptitle(f"{side} knee from above")
     panels = figure.subplots(2, columns).ravel()
     for axes, (name, values) in zip(panels, maps.items(), strict=False):
         top = float(np.max(values)) or 1.0
@@ -383,7 +390,10 @@ def draw_wear(
             z, x, surface.faces[facing], values, shading="gouraud", vmin=0, vmax=top
         )
         axes.set(
-            aspect="equal", title=LABELS[name], xlabel="z (right), mm", ylabel="x (anterior), mm"
+            aspect="equal",
+            title=LABELS[name],
+            xlabel=f"{' ← z, mm → '.join(ends)} (right)",
+            ylabel="x (anterior), mm",
         )
         figure.colorbar(image, ax=axes, shrink=0.7)
     draw_volume(panels[len(maps)], rows)

@@ -16,15 +16,15 @@ import numpy as np
 
 from tkamb import code_identity
 from tkamb.errors import InputError
-from tkamb.files import FILE_LIMITS, read_bytes, replaced_file
+from tkamb.files import FILE_LIMITS, read_bytes, replaced_file, undamaged
 from tkamb.io.scene import Scene
 from tkamb.io.scene.tables import WearTable
 from tkamb.run.guard import interrupt_as_such
 from tkamb.run.identity import foreign_code
-from tkamb.run.recorder import UNREADABLE, Shards, have, read_arrays
+from tkamb.run.recorder import Shards, read_arrays
 from tkamb.run.results import Results
 from tkamb.run.workers import PoolOptions
-from tkamb.studies.wear.bands import BANDED, WEAR_BAND, Progress, Sampling, check_samples
+from tkamb.studies.wear.bands import WEAR_BAND, Progress, Sampling, check_samples
 from tkamb.studies.wear.laws import WearLaw
 from tkamb.studies.wear.materials import DEFAULT_MATERIAL, WearMaterial, wear_material
 from tkamb.studies.wear.report import SAMPLES_NAME, STATE_NAME, WearReport
@@ -71,13 +71,12 @@ def keep_state(folder: Path, state: WearState, identity: str) -> None:
         np.savez(file, allow_pickle=False, identity=np.asarray(identity), rows=rows, **arrays)
 
 
-def kept_state(folder: Path, identity: str, count: int) -> WearState | None:
+def kept_state(folder: Path, identity: str) -> WearState | None:
     """Return the state that is stored in a folder; None if there is none.
 
     Args:
         folder: folder of the simulation.
         identity: hash of the simulation, from `wear_identity`.
-        count: number of articular vertices.
 
     Raises:
         InputError: the state belongs to another simulation, or is damaged.
@@ -85,43 +84,16 @@ def kept_state(folder: Path, identity: str, count: int) -> WearState | None:
     path = folder / STATE_NAME
     if not path.is_file():
         return None
-    try:
+    with undamaged(path, "leave out resume=True to begin again"):
         content = read_arrays(read_bytes(path, FILE_LIMITS.mesh_bytes))
-    except UNREADABLE as error:
-        raise _damaged(path, str(error) or type(error).__name__) from None
-    if str(content.pop("identity", "")) != identity:
-        what = "is of another simulation: bodies, motion, law, numbers or code differ"
-        raise InputError(what, path, "leave out resume=True, or choose another directory")
-    try:
-        rows = json.loads(str(content.pop("rows")))
+        if str(content.pop("identity")) != identity:
+            what = "is of another simulation: bodies, motion, law, numbers or code differ"
+            raise InputError(what, path, "leave out resume=True, or choose another directory")
+        rows = tuple(json.loads(str(content.pop("rows"))))
         values: dict[str, Any] = {
-            name: array.item() if array.ndim == 0 else array for name, array in content.items()
+            name: array if array.ndim else array.item() for name, array in content.items()
         }
-        state = WearState(rows=tuple(rows), **values)
-        is_valid = bool(rows) and all(_is_row(row, rows[0]) for row in rows)
-    except (ValueError, KeyError, TypeError) as error:
-        raise _damaged(path, str(error)) from None
-    arrays = {name: array for name, array in content.items() if array.ndim}
-    if not have(arrays, dict.fromkeys(("wear", "creep", "fall"), ("f", (count,)))):
-        raise _damaged(path, f"its arrays are not of {count} vertices")
-    numbers = (state.cycles, state.step, state.volume, state.creep_volume, state.map_error)
-    is_valid &= all(isinstance(number, float) and math.isfinite(number) for number in numbers)
-    is_valid &= type(state.unsettled) is int and isinstance(state.end, str)
-    if not (is_valid and all(np.isfinite(array).all() for array in arrays.values())):
-        raise _damaged(path, "its values are not numbers")
-    return state
-
-
-def _is_row(row: Any, first: Any) -> bool:
-    return (
-        isinstance(row, dict)
-        and {"cycles", *BANDED} <= row.keys() == first.keys()
-        and all(type(value) in (int, float) for value in row.values())
-    )
-
-
-def _damaged(path: Path, reason: str) -> InputError:
-    return InputError(f"is damaged ({reason})", path, "leave out resume=True to begin again")
+        return WearState(rows=rows, **values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,9 +176,9 @@ class WearRun:
             if folder is not None:
                 keep_state(folder, state, identity)
 
-        count, state = len(self.case.articular.vertices), None
+        state = None
         if folder is not None and resume:
-            state = kept_state(folder, identity, count)
+            state = kept_state(folder, identity)
         try:
             with interrupt_as_such():
                 return simulate_wear(self.case, self.cycles, self.updates, state=state, keep=keep)
@@ -214,7 +186,7 @@ class WearRun:
             stored = None
             if folder is not None:
                 with suppress(InputError):  # the state of another simulation is not reported
-                    stored = kept_state(folder, identity, count)
+                    stored = kept_state(folder, identity)
             if stored is None:
                 raise
             words = f"{stored.cycles:.6g} cycles are kept"

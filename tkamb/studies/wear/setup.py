@@ -206,7 +206,7 @@ def _wear_table(scene: Scene) -> WearTable:
 
 
 def _hashes(case: Case, scene: Scene) -> tuple[str, ...]:
-    hashes = (scene_hash(replace(case, scene=variant)) for variant in (scene, case.scene))
+    hashes = (scene_hash(variant) for variant in (scene, case.scene))
     return tuple(dict.fromkeys(hashes))
 
 
@@ -253,8 +253,7 @@ class _Track(NamedTuple):
 
     @classmethod
     def of_maps(cls, maps: ContactMaps) -> "_Track":
-        load = -np.asarray(maps.nodal_force_N)[:, :, 1].sum(axis=1)
-        return cls(np.asarray(maps.time_s), np.asarray(maps.femoral_pose), load)
+        return cls(np.asarray(maps.time_s), np.asarray(maps.femoral_pose), -maps.forces_N[:, 1])
 
 
 def _cycle_of(
@@ -310,7 +309,7 @@ def _of_results(
             raise InputError(what, folder, "run the scene again") from None
         scene = scene.model_copy(update={"contact": contact})
     case = load_case(scene)
-    if scene_hash(case) != results.summary.get("scene_sha256"):
+    if scene_hash(case.scene) != results.summary.get("scene_sha256"):
         what = "was computed with an earlier version of the scene file"
         raise InputError(what, folder, "run the scene again, or give the scene file")
     chosen = (results.summary.get("identity") or {}).get("choice of frames") or ()

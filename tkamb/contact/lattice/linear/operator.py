@@ -5,7 +5,6 @@ memory. The estimate is a symbolic factorisation on nodes instead of unknowns: t
 fronts follow from the dissection and the pattern alone.
 """
 
-from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -378,9 +377,7 @@ def prepare_operator(
     return ElasticOperator(free, factor, contact_nodes, half.response())
 
 
-def operator_error(
-    operator: ElasticOperator, solid: Solid, response_read: Callable[[], None] | None = None
-) -> float:
+def operator_error(operator: ElasticOperator, solid: Solid) -> float:
     """Return the relative error of an operator, against the stiffness K of its solid.
 
     K is applied cell by cell. The error is the largest of
@@ -396,7 +393,6 @@ def operator_error(
     Args:
         operator: operator to check.
         solid: solid that the operator should belong to.
-        response_read: called after the last use of the response, before the factor is read.
     """
     generator = np.random.default_rng(OPERATOR.test_vector_seed)
     nodes, shape = operator.contact_nodes, solid.nodes.shape
@@ -405,8 +401,6 @@ def operator_error(
     touched[nodes] = generator.normal(size=(len(nodes), 3))
     stored = np.zeros(len(operator.factor.order))
     operator.half.apply(touched[nodes].ravel(), stored)
-    if response_read is not None:
-        response_read()
     displacement = np.where(operator.free.reshape(-1, 3), generator.normal(size=shape), 0.0)
     force = _free_force(operator, solid, displacement)
     difference = _free_force(operator, solid, operator.solve(force)) - force

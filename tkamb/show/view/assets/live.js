@@ -16,7 +16,7 @@ const SLIDERS = {
     ["ml_mm", "ML, mm", -8, 8, 0.1]],
   soft: [["slack_percent", "slack length, %", -10, 10, 0.1]],
 };
-const TOTALS = [["force_si_N", "contact force, N", 0], ["medial_share", "medial share, %", 1],
+const TOTALS = [["force_si_N", "contact force, N", 0], ["medial_share", "medial share by deformation, %", 1],
   ["approach_mm", "approach, mm", 3]];
 const CONDYLE = [["force_N", "force, N", 0], ["peak_pressure_MPa", "peak, MPa", 1],
   ["mean_pressure_MPa", "mean, MPa", 1], ["area_mm2", "area, mm²", 0],

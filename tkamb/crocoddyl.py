@@ -1,0 +1,324 @@
+"""Optimal control of a model with a knee, by Crocoddyl (`pip install "tkamb[control]"`).
+
+`KneeDynamics` is a differential action model: its acceleration is `Knee.forward_dynamics`, and its
+derivatives are exact. Contact on polyethylene is stiff: an explicit integrator needs steps below a
+millisecond. `KneeStep` integrates it by implicit Euler, so that steps of 10 to 50 ms are stable:
+
+    v' = v + h a(q', v', u),    q' = integrate(q, h v').
+
+By the implicit function theorem, with J0 and J1 of `pin.dIntegrate`,
+
+    (I - h a_v - h² a_q J1) dv' = dv + h a_q J0 dq + h a_u du.
+
+`CondyleForces` is a residual for a cost on the contact forces. If the contact model is out of its
+range, or Newton's method does not converge, the next state is NaN: the solver then shortens its
+step.
+
+Reference: Mastalli et al., Crocoddyl: an efficient and versatile framework for multi-contact
+optimal control, ICRA (2020), doi:10.1109/ICRA40945.2020.9196673.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from tkamb.errors import ComputationError, InputError
+from tkamb.geometry.frames import Array
+from tkamb.knee.knee import Knee
+
+try:
+    import crocoddyl
+except ImportError as error:
+    raise InputError(
+        "needs Crocoddyl, which is not installed",
+        "tkamb.crocoddyl",
+        'install it: pip install "tkamb[control]"',
+    ) from error
+
+
+class KneeDynamics(crocoddyl.DifferentialActionModelAbstract):
+    """Forward dynamics of a model with a knee, with costs by the user.
+
+    The control u is that of the actuation, then one tension (N) per muscle of `muscles`.
+
+    Args:
+        state: `crocoddyl.StateMultibody` of `knee.model`.
+        actuation: any actuation model of that state.
+        knee: the knee.
+        costs: `crocoddyl.CostModelSum`; its nu is the number of all controls.
+        muscles: names of muscles whose tensions are controls.
+        tensions: muscle -> constant tension, N.
+
+    Raises:
+        InputError: the state is that of another model, or the costs have another number of
+            controls.
+    """
+
+    def __init__(
+        self,
+        state: Any,
+        actuation: Any,
+        knee: Knee,
+        costs: Any,
+        muscles: Sequence[str] = (),
+        tensions: Mapping[str, float] | None = None,
+    ) -> None:
+        count = actuation.nu + len(muscles)
+        if state.nv != knee.model.nv or state.pinocchio != knee.model:
+            raise InputError("belongs to another model", "state", "give that of knee.model")
+        if costs.nu != count:
+            raise InputError(
+                f"nu is {costs.nu}", "costs", f"give {count}: the actuation, then the muscles"
+            )
+        super().__init__(state, count, costs.nr)
+        knee.checked_tensions(dict.fromkeys(muscles, 0.0) | dict(tensions or {}))
+        self.knee, self.actuation, self.costs = knee, actuation, costs
+        self.muscles, self.tensions = tuple(muscles), dict(tensions or {})
+
+    def createData(self) -> "KneeDynamicsData":
+        """Return new data."""
+        return KneeDynamicsData(self)
+
+    def calc(self, data: "KneeDynamicsData", x: Array, u: Array | None = None) -> None:
+        """Set acceleration and cost; without u, the cost alone."""
+        self.calc_cost(data, x, u)
+        if u is not None:
+            data.xout = self.acceleration(data, x, u)
+
+    def calcDiff(self, data: "KneeDynamicsData", x: Array, u: Array | None = None) -> None:
+        """Set the derivatives of acceleration and cost; without u, those of the cost alone."""
+        self.calc_cost_derivatives(data, x, u)
+        if u is not None:
+            data.Fx, data.Fu = self.acceleration_derivatives(data, x, u)
+
+    def acceleration(self, data: "KneeDynamicsData", x: Array, u: Array) -> Array:
+        """Return the acceleration (nv,); NaN if the contact model is out of its range."""
+        q, v = x[: self.state.nq], x[self.state.nq :]
+        self.actuation.calc(data.actuation, x, u[: self.actuation.nu])
+        tensions = self._tensions(u)
+        if not np.isfinite(x).all() or not all(tension >= 0.0 for tension in tensions.values()):
+            return np.full(self.state.nv, np.nan)
+        try:
+            return self.knee.forward_dynamics(
+                q, v, data.actuation.tau, tensions=tensions, data=data.knee
+            )
+        except ComputationError:
+            return np.full(self.state.nv, np.nan)
+
+    def acceleration_derivatives(
+        self, data: "KneeDynamicsData", x: Array, u: Array
+    ) -> tuple[Array, Array]:
+        """Return the derivatives of the acceleration by x (nv, ndx) and by u (nv, nu)."""
+        q, v, count = x[: self.state.nq], x[self.state.nq :], self.actuation.nu
+        self.actuation.calc(data.actuation, x, u[:count])
+        self.actuation.calcDiff(data.actuation, x, u[:count])
+        tensions = self._tensions(u)
+        by_q, by_v, by_tau = self.knee.forward_dynamics_derivatives(
+            q, v, data.actuation.tau, tensions=tensions, data=data.knee
+        )
+        by_x = np.hstack([by_q, by_v]) + by_tau @ data.actuation.dtau_dx
+        by_u = np.zeros((self.state.nv, self.nu))
+        by_u[:, :count] = by_tau @ np.reshape(data.actuation.dtau_du, (self.state.nv, count))
+        if self.muscles:
+            here = self._force(data, q, v, tensions)
+            for k, name in enumerate(self.muscles, count):
+                # The forces are linear in the tensions.
+                more = self._force(data, q, v, tensions | {name: tensions[name] + 1.0})
+                by_u[:, k] = by_tau @ (more - here)
+        return by_x, by_u
+
+    def calc_cost(self, data: "KneeDynamicsData", x: Array, u: Array | None) -> None:
+        """Set the cost."""
+        self._place(data, x)
+        if u is None:
+            self.costs.calc(data.costs, x)
+        else:
+            self.actuation.calc(data.actuation, x, u[: self.actuation.nu])
+            self.costs.calc(data.costs, x, u)
+        data.cost = data.costs.cost
+
+    def calc_cost_derivatives(self, data: "KneeDynamicsData", x: Array, u: Array | None) -> None:
+        """Set the derivatives of the cost."""
+        self._place(data, x)
+        pin.computeJointJacobians(self.state.pinocchio, data.pinocchio, x[: self.state.nq])
+        pin.jacobianCenterOfMass(self.state.pinocchio, data.pinocchio, x[: self.state.nq])
+        if u is None:
+            self.costs.calcDiff(data.costs, x)
+        else:
+            self.costs.calcDiff(data.costs, x, u)
+
+    def _place(self, data: "KneeDynamicsData", x: Array) -> None:
+        model, q, v = self.state.pinocchio, x[: self.state.nq], x[self.state.nq :]
+        pin.forwardKinematics(model, data.pinocchio, q, v)
+        pin.updateFramePlacements(model, data.pinocchio)
+        pin.centerOfMass(model, data.pinocchio, q, v)
+
+    def _tensions(self, u: Array) -> dict[str, float]:
+        controls = u[self.actuation.nu :].tolist()
+        return self.tensions | dict(zip(self.muscles, controls, strict=True))
+
+    def _force(self, data: "KneeDynamicsData", q: Array, v: Array, tensions: Any) -> Array:
+        """Return the generalised force (nv,) of the knee."""
+        forces = self.knee.external_forces(q, v, tensions, data.knee)
+        jacobians, total = data.knee.data, np.zeros(self.state.nv)
+        pin.computeJointJacobians(self.knee.model, jacobians, q)
+        for joint in range(1, self.knee.model.njoints):
+            local = pin.getJointJacobian(
+                self.knee.model, jacobians, joint, pin.ReferenceFrame.LOCAL
+            )
+            total += local.reshape(6, -1).T @ forces[joint].vector
+        return total
+
+
+class KneeDynamicsData(crocoddyl.DifferentialActionDataAbstract):
+    """Data of `KneeDynamics`: those of the knee, Pinocchio, the actuation and the costs."""
+
+    def __init__(self, model: KneeDynamics) -> None:
+        super().__init__(model)
+        self.knee = model.knee.create_data()
+        self.pinocchio = pin.Data(model.state.pinocchio)
+        self.actuation = model.actuation.createData()
+        self.collector = crocoddyl.DataCollectorActMultibody(self.pinocchio, self.actuation)
+        self.costs = model.costs.createData(self.collector)
+        self.costs.shareMemory(self)
+
+
+class KneeStep(crocoddyl.ActionModelAbstract):
+    """One step of `KneeDynamics` by implicit Euler; the equations are those of this module.
+
+    The cost is that of the differential model at x and u, times the step. With a step of zero the
+    state does not change, and the cost is not multiplied: this is the terminal model.
+
+    Args:
+        dynamics: the differential model.
+        step: time step, s.
+    """
+
+    velocity_tolerance = 1e-9
+    """m/s and rad/s: residual at which Newton's method has converged. Chosen far below any speed of
+    a knee, because the derivatives are those of the converged step."""
+    max_newton_steps = 25
+    """Maximum number of Newton steps. Not studied."""
+
+    def __init__(self, dynamics: KneeDynamics, step: float) -> None:
+        if not (np.isfinite(step) and step >= 0.0):
+            raise InputError(f"step {step} s", "KneeStep", "give 0 or more")
+        super().__init__(dynamics.state, dynamics.nu, dynamics.nr)
+        self.dynamics, self.step = dynamics, float(step)
+
+    def createData(self) -> "KneeStepData":
+        """Return new data."""
+        return KneeStepData(self)
+
+    def calc(self, data: "KneeStepData", x: Array, u: Array | None = None) -> None:
+        """Set the next state and the cost."""
+        self.dynamics.calc_cost(data.differential, x, u)
+        data.cost = data.differential.cost * (self.step or 1.0)
+        if u is None or not self.step:
+            data.xnext = x
+            return
+        end = self._next(data, x, u)
+        data.xnext = np.full(len(x), np.nan) if end is None else end
+
+    def calcDiff(self, data: "KneeStepData", x: Array, u: Array | None = None) -> None:
+        """Set the derivatives of the next state and of the cost."""
+        inner, factor, size = data.differential, self.step or 1.0, self.state.nv
+        self.dynamics.calc_cost_derivatives(inner, x, u)
+        data.Lx, data.Lxx = factor * np.array(inner.Lx), factor * np.array(inner.Lxx)
+        if u is not None:
+            data.Lu, data.Luu = factor * np.array(inner.Lu), factor * np.array(inner.Luu)
+            data.Lxu = factor * np.array(inner.Lxu)
+        if u is None or not self.step:
+            data.Fx, data.Fu = np.eye(2 * size), np.zeros((2 * size, self.nu))
+            return
+        end, h = data.xnext, self.step
+        by_x, by_u = self.dynamics.acceleration_derivatives(inner, end, u)
+        q, travel = x[: self.state.nq], h * end[self.state.nq :]
+        first, second = pin.dIntegrate(self.dynamics.knee.model, q, travel)
+        by_q, by_v = by_x[:, :size], by_x[:, size:]
+        matrix = np.eye(size) - h * by_v - h**2 * by_q @ second
+        right = np.hstack([h * by_q @ first, np.eye(size), h * by_u])
+        velocity = np.linalg.solve(matrix, right)
+        position = h * second @ velocity
+        position[:, :size] += first
+        both = np.vstack([position, velocity])
+        data.Fx, data.Fu = both[:, : 2 * size], both[:, 2 * size :]
+
+    def _next(self, data: "KneeStepData", x: Array, u: Array) -> Array | None:
+        """Return the next state; None: Newton's method does not converge."""
+        model, inner, h, nq = self.dynamics.knee.model, data.differential, self.step, self.state.nq
+        q, v = x[:nq], x[nq:]
+        if not (np.isfinite(x).all() and np.isfinite(u).all()):
+            return None
+
+        def residual(velocity: Array) -> tuple[Array, Array]:
+            at = np.concatenate([pin.integrate(model, q, h * velocity), velocity])
+            return at, velocity - v - h * self.dynamics.acceleration(inner, at, u)
+
+        start = v if data.velocity is None else data.velocity
+        end, error = residual(start)
+        if not np.isfinite(error).all():
+            start = v
+            end, error = residual(start)
+        for _ in range(self.max_newton_steps):
+            size = float(np.abs(error).max())
+            if not np.isfinite(size):
+                return None
+            if size < self.velocity_tolerance:
+                data.velocity = end[nq:]
+                return end
+            by_x, _ = self.dynamics.acceleration_derivatives(inner, end, u)
+            count = self.state.nv
+            _, second = pin.dIntegrate(model, q, h * end[nq:])
+            matrix = np.eye(count) - h * by_x[:, count:] - h**2 * by_x[:, :count] @ second
+            change = np.linalg.solve(matrix, error)
+            for share in (1.0, 0.5, 0.25, 0.1, 0.03):
+                trial, trial_error = residual(end[nq:] - share * change)
+                trial_size = float(np.abs(trial_error).max())
+                if trial_size < size:  # false for NaN
+                    break
+            end, error = trial, trial_error
+        return None
+
+
+class KneeStepData(crocoddyl.ActionDataAbstract):
+    """Data of `KneeStep`; `velocity` is the last velocity, the first guess of the next call."""
+
+    def __init__(self, model: KneeStep) -> None:
+        super().__init__(model)
+        self.differential = model.dynamics.createData()
+        self.velocity: Array | None = None
+
+
+class CondyleForces(crocoddyl.ResidualModelAbstract):
+    """Residual: the contact forces of the medial and the lateral condyle, N, shape (2,).
+
+    The forces depend on q alone. They are NaN if the contact model is out of its range. The contact
+    model needs an exact tangent, as the foundation has.
+
+    Args:
+        state: `crocoddyl.StateMultibody` of `knee.model`.
+        knee: a knee with a contact model.
+        nu: number of controls.
+    """
+
+    def __init__(self, state: Any, knee: Knee, nu: int) -> None:
+        super().__init__(state, 2, nu, True, False, False)
+        self.knee = knee
+        self._data = knee.create_data()
+
+    def calc(self, data: Any, x: Array, u: Array | None = None) -> None:
+        """Set the forces."""
+        data.r = self._forces(x)[0]
+
+    def calcDiff(self, data: Any, x: Array, u: Array | None = None) -> None:
+        """Set the derivative of the forces by x."""
+        data.Rx[:, :] = np.hstack([self._forces(x)[1], np.zeros((2, self.state.nv))])
+
+    def _forces(self, x: Array) -> tuple[Array, Array]:
+        try:
+            return self.knee.condyle_forces(x[: self.state.nq], self._data)
+        except ComputationError:
+            return np.full(2, np.nan), np.full((2, self.state.nv), np.nan)

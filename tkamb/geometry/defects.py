@@ -1,0 +1,189 @@
+"""Defects of a triangulated surface that change a contact: openings, spikes, noise and steps.
+
+Each vertex is compared with a quadric through its nearest other vertices. On a smooth surface the
+difference is far below a contact's approach (about 0.1 mm), whatever the size of the facets is. A
+spike is one vertex far from the quadric of smooth neighbours; noise is a difference everywhere.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from tkamb.geometry.frames import Array, Index
+from tkamb.geometry.topology import BoundaryLoop, boundary_loops
+from tkamb.units import MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.geometry.surface import Surface
+
+Kind = Literal["opening", "spike", "noise", "steps"]
+
+
+@dataclass(frozen=True)
+class DefectSettings:
+    """Definition of a defect of a surface."""
+
+    neighbours: int = 18
+    """Number of nearest vertices for a quadric: three times its six coefficients."""
+    spike: float = 0.2 * MILLIMETRE
+    """m: smallest height of a spike. Chosen above the largest difference of 0.12 mm on the dishes
+    of the insert of a public data set."""
+    least_ring: int = 3
+    """Smallest number of nearest vertices that share a triangle with a spike. By definition of a
+    tip on a surface."""
+    spike_ratio: float = 6.0
+    """1: smallest ratio of a spike's height to the roughness around it. Not studied."""
+    noise: float = 0.01 * MILLIMETRE
+    """m: roughness of a noisy surface. Chosen: a tenth of the approach of a knee's contact."""
+    directions: int = 26
+    """Number of directions of the facets that marching cubes make of voxels."""
+    direction_share: float = 0.9
+    """1: smallest share of the area in that number of directions, on a surface of voxels. Chosen:
+    a smooth surface of an implant has less than half in so few."""
+    levels: int = 6
+    """Smallest number of equidistant levels of a surface of voxels. Chosen because a component
+    with flat cuts has fewer."""
+    least_cosine: float = 0.8
+    """1: smallest cosine between the normals of noisy neighbours and their mean; a smaller one is a
+    crease. Chosen: the edge of a component turns by more than twice this angle."""
+    least_eigenvalue: float = 1e-3
+    """1: smallest eigenvalue of the normal equations, at neighbours within the unit disc. With a
+    smaller one the quadric is not determined. Not studied."""
+    cap_spacing: float = 0.5 * MILLIMETRE
+    """m: spacing of the points that fill an opening. Chosen below the cells of a map."""
+
+
+DEFECT = DefectSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class Defect:
+    """A defect of a surface.
+
+    Args:
+        kind: kind of defect.
+        words: the defect in words, like "an opening 6 mm wide".
+        places: (m, 3) m, points of the defect, frame of the surface.
+    """
+
+    kind: Kind
+    words: str
+    places: Array
+
+
+def defects_of(surface: "Surface") -> tuple[Defect, ...]:
+    """Return the defects of a surface."""
+    found = [_opening(surface, loop) for loop in _loops(surface)]
+    steps = _steps(surface)
+    if steps is not None:
+        return (*found, steps)
+    vertices = np.unique(surface.corner_vertices)
+    if len(vertices) <= DEFECT.neighbours + 1:
+        return tuple(found)
+    points = surface.vertices[vertices]
+    near: Index = cKDTree(points).query(points, DEFECT.neighbours + 1)[1][:, 1:]
+    height, roughness = _heights(points, _normals(surface)[vertices], near)
+    calm = roughness < DEFECT.noise
+    spikes = calm & (np.abs(height) > np.maximum(DEFECT.spike, DEFECT.spike_ratio * roughness))
+    for n in np.flatnonzero(spikes):
+        # The tip of a fan of long triangles is no spike: its neighbours are on other surfaces.
+        ring = surface.corner_vertices[(surface.corner_vertices == vertices[n]).any(axis=1)]
+        if np.isin(vertices[near[n]], ring).sum() < DEFECT.least_ring:
+            continue
+        words = f"a spike of {abs(height[n]) / MILLIMETRE:.2g} mm"
+        found.append(Defect("spike", words, points[n : n + 1]))
+    rough = ~calm & ~spikes[near].any(axis=1)
+    if rough.any():
+        size = float(np.median(roughness[rough]))
+        words = f"noise of about {size / MILLIMETRE:.1g} mm"
+        found.append(Defect("noise", words, points[rough]))
+    return tuple(found)
+
+
+def _loops(surface: "Surface") -> list[BoundaryLoop]:
+    return boundary_loops(surface.vertices, surface.corner_vertices)
+
+
+def _opening(surface: "Surface", loop: BoundaryLoop) -> Defect:
+    """Return an opening, with points on the smooth cap that would close it.
+
+    The cap is a paraboloid over the loop's mean plane. Its sagitta is half of the mean height of
+    the loop's tangent planes above the centre.
+    """
+    ring = surface.vertices[loop.vertices]
+    normals = _normals(surface)[loop.vertices]
+    axis = normals.sum(axis=0)
+    axis /= max(float(np.linalg.norm(axis)), 1e-12)
+    lean = normals @ axis
+    height = np.einsum("ij,ij->i", ring - loop.centre, normals)
+    steep = lean < 0.5
+    sagitta = 0.0 if steep.all() else 0.5 * float(np.mean(height[~steep] / lean[~steep]))
+    reach = float(np.linalg.norm(ring - loop.centre, axis=1).max())
+    count = int(np.clip(np.ceil(reach / DEFECT.cap_spacing), 1, 40)) + 1
+    share = np.linspace(0.0, 1.0, count)[:, None, None]
+    cap = loop.centre + share * (ring - loop.centre) + (1.0 - share**2) * sagitta * axis
+    words = f"an opening {loop.width / MILLIMETRE:.2g} mm wide"
+    return Defect("opening", words, cap.reshape(-1, 3))
+
+
+def _normals(surface: "Surface") -> Array:
+    """Return the area-weighted unit normal (n, 3) of each vertex; zero for an unused one."""
+    weighted = surface.areas[:, None] * surface.face_normals
+    vertex = surface.corner_vertices.ravel()
+    rows = np.repeat(weighted, 3, axis=0)
+    total = np.stack([np.bincount(vertex, c, len(surface.vertices)) for c in rows.T], axis=1)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.divide(total, length, out=np.zeros_like(total), where=length > 0)
+
+
+def _heights(points: Array, normals: Array, near: Index) -> tuple[Array, Array]:
+    """Return each point's height (n,), m, over its neighbours' quadric, and their residual (n,).
+
+    The residual is the root mean square of the neighbours' distances from the quadric. Both are
+    zero where neighbours lie beyond a crease or do not determine a quadric.
+    """
+    axis = normals[near].sum(axis=1)
+    axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-12)
+    cosine = np.einsum("nkj,nj->nk", normals[near], axis)
+    other = np.where(np.abs(axis[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    first = np.cross(axis, other)
+    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-12)
+    second = np.cross(axis, first)
+    offset = points[near] - points[:, None]
+    scale = np.maximum(np.linalg.norm(offset, axis=2).max(axis=1), 1e-12)[:, None]
+    u, v, w = (np.einsum("nkj,nj->nk", offset, a) / scale for a in (first, second, axis))
+    terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=2)
+    square = np.einsum("nki,nkj->nij", terms, terms) + 1e-9 * np.eye(6)
+    right = np.einsum("nki,nk->ni", terms, w)
+    fit = np.linalg.solve(square, right[..., None])[..., 0]
+    left = w - np.einsum("nki,ni->nk", terms, fit)
+    residual = np.sqrt((left**2).mean(axis=1)) * scale[:, 0]
+    height = -fit[:, 0] * scale[:, 0]
+    known = np.linalg.eigvalsh(square)[:, 0] > DEFECT.least_eigenvalue
+    # A spike tilts the normals beside it, but its neighbours fit a quadric.
+    facing = known & (cosine > 0.0).all(axis=1)
+    smooth = known & (cosine > DEFECT.least_cosine).all(axis=1)
+    calm = facing & (residual < DEFECT.noise)
+    return np.where(smooth | calm, height, 0.0), np.where(smooth, residual, 0.0)
+
+
+def _steps(surface: "Surface") -> Defect | None:
+    """Return the steps of a surface of voxels; None if it is none."""
+    normals, areas = surface.face_normals, surface.areas
+    key = np.round(normals / 0.02).astype(np.int64) @ [1, 1000, 1000000]
+    _, group = np.unique(key, return_inverse=True)
+    area = np.bincount(group.reshape(-1), areas)
+    largest = np.argsort(-area)[: DEFECT.directions]
+    if area[largest].sum() < DEFECT.direction_share * areas.sum():
+        return None
+    members = np.flatnonzero(group.reshape(-1) == largest[0])
+    axis = normals[members].mean(axis=0)
+    level = np.sort(surface.triangles[members].mean(axis=1) @ axis)
+    gap = np.diff(level)
+    gap = gap[gap > DEFECT.noise]
+    if len(gap) < DEFECT.levels - 1 or not (np.abs(gap / np.median(gap) - 1.0) < 0.05).mean() > 0.7:
+        return None
+    words = f"steps of {np.median(gap) / MILLIMETRE:.2g} mm"
+    return Defect("steps", words, surface.vertices)

@@ -1,0 +1,370 @@
+"""Derivatives of the knee's forces and of a model's dynamics with them.
+
+w_L is the wrench of all loads on a link L (tibia, femur, patella) about the insert's origin, in the
+insert frame. It depends on the pose of the femur, on the coordinates c of the patella, and by
+friction on the twist s of the femur relative to the insert. xi_L is the twist of L relative to the
+insert per joint velocity. Then
+
+    dw_L/dq = K_L xi_F + C_L dc/dq + D_L ds/dq,        dw_L/dv = D_L xi_F,
+
+and the force f of L in the frame of its joint changes by
+
+    df = A (dw_L - xi_L x* w_L),
+
+where A maps a force from the insert frame to the joint's frame. The second term is geometric: a
+force that is constant in the insert frame turns in the frame of a joint that moves against the
+insert. For a twist (v, w) and a force (f, m), (v, w) x* (f, m) = (w x f, w x m + v x f).
+
+If the model has no patella, its coordinates solve three equations g(pose, c) = 0: gap, length of
+the patellar ligament, moment (`tkamb.knee.patella_search`). By the implicit function theorem
+
+    dc = -(dg/dc)^-1 (dg/dpose) xi_F.
+
+The derivatives of pin.aba and pin.rnea with constant forces come from Pinocchio. The change of the
+forces adds J_j^T df_j for each joint j with its Jacobian J_j:
+
+    da/dq = (da/dq)_f + M^-1 sum_j J_j^T df_j/dq,
+    dtau/dq = (dtau/dq)_f - sum_j J_j^T df_j/dq.
+
+All derivatives by q are in the tangent space: q changes as by `pin.integrate(model, q, dq)`. v is
+constant in the axes of the joints. The contact's tangent, ligaments, friction and straight muscle
+lines are analytic. The derivatives of the extensor mechanism by the pose of the femur and by c are
+inner central differences of its closed forms (no search is repeated).
+
+Reference: Carpentier & Mansard, Analytical derivatives of rigid body dynamics algorithms, RSS
+(2018), doi:10.15607/RSS.2018.XIV.038.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pinocchio as pin
+
+from tkamb.geometry.frames import Array
+from tkamb.knee.anatomy import FixedFrame
+from tkamb.knee.canonical import KneePose, mirrored_spatial, summed
+
+if TYPE_CHECKING:
+    from tkamb.knee.assembled import KneeData
+    from tkamb.knee.knee import Knee
+    from tkamb.knee.patella import PatellaState
+
+
+@dataclass(frozen=True)
+class ForceDerivativeSettings:
+    """Inner central differences of the extensor mechanism and of joint twists."""
+
+    pose_step: float = 1e-6
+    """m: step of the femur's pose. Chosen because rounding errors are below 1e-9 and the error of
+    the difference is below 1e-8 of the derivative."""
+    patella_step: float = 1e-7
+    """m: step of the patella's coordinates. Chosen shorter, because the facets under the button are
+    short."""
+    arm: float = 0.025
+    """m: lever arm; a rotation's step is the step over this arm. Chosen as half the distance of the
+    condyles."""
+    joint_step: float = 1e-6
+    """m and rad: step of q for the twist of a model with mimic joints, for which Pinocchio has no
+    velocity derivatives. Chosen as `pose_step`."""
+
+
+FORCE_DERIVATIVE = ForceDerivativeSettings()
+
+LINKS = ("tibia", "femur", "patella")
+
+
+@dataclass(frozen=True, eq=False)
+class RelativeTwists:
+    """Twists of the knee's bodies per joint velocity, in the insert frame of the user's knee.
+
+    Args:
+        femur: xi of the femur relative to the insert, shape (6, nv).
+        patella: xi of the link "patella" relative to the insert, shape (6, nv).
+        coordinates: derivative of the patella's coordinates, shape (3, nv); None: the model has no
+            patella.
+    """
+
+    femur: Array
+    patella: Array
+    coordinates: Array | None
+
+
+def force_derivatives(
+    knee: "Knee", q: Array, v: Array, tensions: Any, data: "KneeData"
+) -> tuple[Array, Array]:
+    """Return the result of `Knee.external_forces_derivatives`."""
+    twists = relative_twists(knee, q, data)
+    kinematics = knee.at(q, data, v)
+    muscle_tensions = knee.checked_tensions(tensions)
+    wrenches, by_q, by_v = _between(knee, data, kinematics, twists, q, v)
+    beside, slopes = _beside(knee, data, kinematics, muscle_tensions, twists)
+    for link, wrench in beside.items():
+        wrenches[link] = wrenches[link] + wrench
+        by_q[link] = by_q[link] + slopes[link]
+    shape = knee.model.njoints, 6, knee.model.nv
+    df_dq, df_dv = np.zeros(shape), np.zeros(shape)
+    for link in LINKS:
+        joint, to_joint = knee.bridge.joint_of(link), knee.bridge.to_joint(data.data, link)
+        wrench, change, rate = (_users(knee, m[link]) for m in (wrenches, by_q, by_v))
+        twist = {"femur": twists.femur, "patella": twists.patella}.get(link)
+        # The tibia does not move against the insert; the other bodies do.
+        if twist is not None:
+            change = change - force_cross(twist, wrench)
+        df_dq[joint] += to_joint @ change
+        df_dv[joint] += to_joint @ rate
+    for name, line in knee.muscle_lines.items():
+        if tension := muscle_tensions.get(name, 0.0):
+            line.add_derivatives(knee.model, data.data, tension, df_dq)
+    return df_dq, df_dv
+
+
+def force_cross(twists: Array, wrench: Array) -> Array:
+    """Return xi x* w (6, n) of twists xi (6, n) and a wrench w (6,)."""
+    linear, angular = twists[:3].T, twists[3:].T
+    force, moment = wrench[:3], wrench[3:]
+    return np.concatenate(
+        [np.cross(angular, force), np.cross(angular, moment) + np.cross(linear, force)], axis=1
+    ).T
+
+
+def relative_twists(knee: "Knee", q: Array, data: "KneeData") -> RelativeTwists:
+    """Return the twists of femur and patella at q, and update `data`."""
+    femur, bridge, anatomy = knee.relative_jacobian(q, data), knee.bridge, knee.anatomy
+    if anatomy.patella is None or knee.extensor is None:
+        return RelativeTwists(femur, femur, None)
+    pin_data = data.data
+    patella = _relative_jacobian(knee.model, pin_data, anatomy.patella, bridge.insert)
+    # In the patella's plane: twist and pose of the patella, mirrored for a left knee.
+    in_plane = _relative_jacobian(knee.model, pin_data, anatomy.patella, anatomy.plane)
+    in_plane = _users(knee, in_plane)
+    plane = pin_data.oMi[anatomy.plane.joint] * anatomy.plane.placement
+    placement = pin_data.oMi[anatomy.patella.joint] * anatomy.patella.placement
+    pose = bridge.of_right_knee(plane.actInv(placement))
+    centre = in_plane[:3] + np.cross(in_plane[3:].T, pose[:3, 3]).T
+    front = np.cross(in_plane[3:].T, pose[:3, 0]).T
+    # The rotation is the angle of the patella's x axis in the plane: d atan2(y, x).
+    x, y = pose[0, 0], pose[1, 0]
+    rotation = (x * front[1] - y * front[0]) / (x**2 + y**2)
+    return RelativeTwists(femur, patella, np.stack([centre[0], centre[1], rotation]))
+
+
+def _users(knee: "Knee", columns: Array) -> Array:
+    """Return twists or wrenches (6, ...) of a right knee as those of the user's knee, or back."""
+    return mirrored_spatial(columns.T).T if knee.left else columns
+
+
+def _relative_jacobian(model: Any, data: Any, follower: FixedFrame, base: FixedFrame) -> Array:
+    """Return the twist (6, nv) of one body relative to another, at the origin of `base`."""
+    placement, total = data.oMi[base.joint] * base.placement, np.zeros((6, model.nv))
+    for frame, sign in ((follower, 1.0), (base, -1.0)):
+        if frame.joint:
+            local = pin.getJointJacobian(model, data, frame.joint, pin.ReferenceFrame.LOCAL)
+            to_base = placement.actInv(data.oMi[frame.joint]).toActionMatrix()
+            total += sign * to_base @ local.reshape(6, -1)
+    return total
+
+
+def _between(
+    knee: "Knee",
+    data: "KneeData",
+    kinematics: KneePose,
+    twists: RelativeTwists,
+    q: Array,
+    v: Array,
+) -> tuple[dict[str, Array], dict[str, Array], dict[str, Array]]:
+    """Return link -> wrench (6,), its derivative (6, nv) by q, and by v, of contact and ligaments.
+
+    The ligaments are those between femur and tibia. All values are those of a right knee.
+    """
+    on_insert, by_q = np.zeros(6), np.zeros((6, knee.model.nv))
+    by_v, femur = np.zeros_like(by_q), _users(knee, twists.femur)
+    stiffness = knee.crossing_stiffness(kinematics)
+    if knee.contact is not None:
+        twist = knee.bridge.twist(data.data)
+        contact = knee.contact_at(data, kinematics)
+        on_insert += knee.contact.wrench(contact, twist)
+        stiffness = stiffness + knee.contact.stiffness(
+            data.probe, kinematics.pose, contact, twist, True
+        )
+        if knee.friction:
+            damping = knee.contact.damping(contact, twist)
+            by_v = damping @ femur
+            if np.any(v):
+                by_q = damping @ _users(knee, twist_derivative(knee, data.data, twists.femur, q, v))
+    if knee.crossing is not None:
+        on_insert += knee.crossing.wrench(kinematics.pose)
+    # Action and reaction: the femur's wrench is the opposite of the tibia's.
+    by_q = by_q + stiffness @ femur
+    zero = np.zeros(6), np.zeros_like(by_q), np.zeros_like(by_q)
+    total = on_insert, by_q, by_v
+    wrenches, slopes, rates = (
+        {"tibia": one, "femur": -one, "patella": nothing}
+        for one, nothing in zip(total, zero, strict=True)
+    )
+    return wrenches, slopes, rates
+
+
+def twist_derivative(knee: "Knee", data: Any, femur: Array, q: Array, v: Array) -> Array:
+    """Return the derivative (6, nv) of the femur's twist relative to the insert by q, at v.
+
+    The twist is in the insert frame of the user's knee.
+
+    Args:
+        knee: the knee.
+        data: Pinocchio data with placements and velocities at q and v.
+        femur: twist of the femur relative to the insert per joint velocity, shape (6, nv).
+        q: configuration, shape (nq,).
+        v: velocity, shape (nv,).
+    """
+    model, bridge = knee.model, knee.bridge
+    if len(model.mimicking_joints):
+        return _twist_differences(knee, q, v)
+    pin.computeForwardKinematicsDerivatives(model, data, q, v, np.zeros(model.nv))
+    insert = data.oMi[bridge.insert.joint] * bridge.insert.placement
+    total = np.zeros((6, model.nv))
+    for frame, sign in ((bridge.component, 1.0), (bridge.insert, -1.0)):
+        if not frame.joint:
+            continue
+        by_q, _ = pin.getJointVelocityDerivatives(
+            model, data, frame.joint, pin.ReferenceFrame.LOCAL
+        )
+        to_insert = insert.actInv(data.oMi[frame.joint])
+        total += sign * to_insert.toActionMatrix() @ by_q
+        if sign > 0.0:
+            # The femur's axes turn against the insert: xi x (X v_F).
+            velocity = to_insert.act(data.v[frame.joint])
+            total -= velocity.action @ femur
+    return total
+
+
+def _twist_differences(knee: "Knee", q: Array, v: Array) -> Array:
+    """Return the result of `twist_derivative` by central differences of J(q) v."""
+    model, step = knee.model, FORCE_DERIVATIVE.joint_step
+    columns = []
+    for direction in step * np.eye(model.nv):
+        ahead, behind = (
+            knee.relative_jacobian(pin.integrate(model, q, sign * direction)) @ v
+            for sign in (1.0, -1.0)
+        )
+        columns.append((ahead - behind) / (2.0 * step))
+    return np.array(columns).T
+
+
+Loads = Mapping[str, Array]
+
+
+def _beside(
+    knee: "Knee",
+    data: "KneeData",
+    kinematics: KneePose,
+    tensions: Mapping[str, float],
+    twists: RelativeTwists,
+) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Return link -> wrench (6,), and its derivative (6, nv), of the loads beside the contact.
+
+    These are the extensor mechanism and the ligaments that end on the patella.
+    """
+    if not knee.loads_patella(tensions):
+        return {}, {}
+    patella = knee.patella_at(kinematics, data) if knee.extensor_lines is not None else None
+    by_pose, by_patella, wrenches = _slopes_beside(knee, kinematics, patella, tensions)
+    femur = _users(knee, twists.femur)
+    slopes = {link: by_pose[link] @ femur for link in LINKS}
+    if patella is not None:
+        change = twists.coordinates
+        # Without a patella in the model its equilibrium gives its movement.
+        if change is None:
+            change = _patella_slopes(knee, kinematics, patella) @ femur
+        slopes = {link: slopes[link] + by_patella[link] @ change for link in LINKS}
+    return wrenches, slopes
+
+
+def _slopes_beside(
+    knee: "Knee",
+    kinematics: KneePose,
+    patella: "PatellaState | None",
+    tensions: Mapping[str, float],
+) -> tuple[dict[str, Array], dict[str, Array], dict[str, Array]]:
+    """Return link -> derivative by the pose (6, 6), by the patella (6, 3), and wrench (6,)."""
+
+    def total(pose: Array, state: "PatellaState | None") -> Array:
+        loads = summed(knee.loads_beside(replace(kinematics, pose=pose), state, tensions))
+        return np.concatenate([loads.get(link, np.zeros(6)) for link in LINKS])
+
+    if patella is None:
+        by_pose = _pose_differences(lambda pose: total(pose, None), kinematics.pose)
+        by_patella, here = np.zeros((18, 3)), total(kinematics.pose, None)
+    else:
+        lines, pose = knee.extensor_lines, kinematics.pose
+        assert lines is not None
+        contact = lines.mechanism.contact.at(patella.coordinates)
+        by_pose = _pose_differences(
+            lambda moved: total(moved, lines.given(moved, patella.coordinates, contact)), pose
+        )
+        by_patella = _patella_differences(
+            lambda coordinates: total(pose, lines.given(pose, coordinates)), patella.coordinates
+        )
+        here = total(pose, patella)
+    return tuple(  # type: ignore[return-value]
+        {link: part[6 * k : 6 * k + 6] for k, link in enumerate(LINKS)}
+        for part in (by_pose, by_patella, here)
+    )
+
+
+def _patella_slopes(knee: "Knee", kinematics: KneePose, patella: "PatellaState") -> Array:
+    """Return the derivative (3, 6) of a solved patella's coordinates by the femur's pose."""
+    from tkamb.knee.patella import PatellaFrame
+
+    lines = knee.extensor_lines
+    assert lines is not None
+    mechanism, coordinates = lines.mechanism, patella.coordinates
+    contact = mechanism.contact.at(coordinates)
+    here = PatellaFrame(mechanism, kinematics.pose)
+
+    def conditions(frame: PatellaFrame, at: Array, touching: Any) -> Array:
+        balance = frame.balance_at(at, touching)
+        return np.array([balance.contact.gap, balance.ligament.length, balance.moment])
+
+    by_pose = _pose_differences(
+        lambda pose: conditions(PatellaFrame(mechanism, pose), coordinates, contact),
+        kinematics.pose,
+    )
+    by_patella = _patella_differences(
+        lambda at: conditions(here, at, mechanism.contact.at(at)), coordinates
+    )
+    return np.asarray(-np.linalg.solve(by_patella, by_pose))
+
+
+def _pose_differences(values: Callable[[Array], Array], pose: Array) -> Array:
+    """Return the derivative (n, 6) of values (n,) by a displacement of the femur."""
+    from tkamb.knee.contact import DifferenceSettings, differences
+
+    settings = DifferenceSettings(step=FORCE_DERIVATIVE.pose_step, arm=FORCE_DERIVATIVE.arm)
+    return differences(values, pose, settings)
+
+
+def _patella_differences(values: Callable[[Array], Array], coordinates: Array) -> Array:
+    """Return the derivative (n, 3) of values (n,) by the patella's coordinates."""
+    step, columns = FORCE_DERIVATIVE.patella_step, []
+    for k, size in enumerate((step, step, step / FORCE_DERIVATIVE.arm)):
+        move = size * np.eye(3)[k]
+        columns.append((values(coordinates + move) - values(coordinates - move)) / (2.0 * size))
+    return np.array(columns).T
+
+
+def generalised(model: Any, data: Any, changes: Array) -> Array:
+    """Return sum_j J_j^T df_j (nv, nv) of changes df (njoints, 6, nv) of the joints' forces.
+
+    Args:
+        model: the user's model.
+        data: Pinocchio data after `pin.computeJointJacobians`.
+        changes: derivative of each joint's force in its joint's frame.
+    """
+    total = np.zeros((model.nv, model.nv))
+    for joint in range(1, model.njoints):
+        if changes[joint].any():
+            local = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.LOCAL)
+            total += local.reshape(6, -1).T @ changes[joint]
+    return total

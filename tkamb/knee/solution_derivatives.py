@@ -1,0 +1,263 @@
+"""Derivatives of a press and of an equilibrium, by the implicit function theorem.
+
+A solution x of r(x, p) = 0 depends on a parameter p by
+
+    dx/dp = -(dr/dx)^-1 dr/dp.
+
+For a press, x is the height y of the femur, and r the difference of load and reaction. For an
+equilibrium, x are the released coordinates, and r the forces on them. All derivatives are those at
+the converged state: the contact is not solved again, its exact tangent gives its change. Patella
+and lines of the extensor mechanism are solved again at displaced poses, each from its neighbour.
+"""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tkamb.errors import InputError
+from tkamb.geometry.frames import SIDES, Array, knee_axes, knee_pose
+from tkamb.knee.contact import DifferenceSettings, displaced
+
+if TYPE_CHECKING:
+    from tkamb.contact.model import ProbedContact
+    from tkamb.contact.pair import ContactPair
+    from tkamb.knee.instant import Instant
+    from tkamb.knee.released import KneeEquilibrium, ReleasedKnee
+
+PRESS_ROWS = ("medial_force", "lateral_force", "approach", "height")
+"""Rows of `PressDerivatives`."""
+TOUCH_DIFFERENCE = DifferenceSettings(step=1e-9)
+"""Steps of the central differences of the height of first touch, which is exact for triangles."""
+EQUILIBRIUM_DIFFERENCE = DifferenceSettings(step=1e-6)
+"""Steps of the central differences of patella and lines in an equilibrium."""
+
+
+@dataclass(frozen=True, eq=False)
+class PressDerivatives:
+    """Derivatives of a press. The rows are those of `PRESS_ROWS`, N and m.
+
+    Args:
+        by_load: derivative by the load, shape (4,), 1 and m/N.
+        by_pose: derivative by a displacement of the femur at the pressed pose, shape (4, 6): the
+            translation (m) of its point at the insert's origin, then the rotation (rad), in the
+            insert frame. The press then changes the height; the translation along y has no effect.
+    """
+
+    by_load: Array
+    by_pose: Array
+
+
+def exact_tangent(contact: "ProbedContact", name: str) -> None:
+    """Raise an error unless a contact has the exact tangent.
+
+    Raises:
+        InputError: it has not; the message names the model.
+    """
+    if not (contact.known and contact.tangent and contact.exact):
+        raise InputError(
+            f"contact model '{name}' has no exact tangent",
+            "derivatives",
+            "take the foundation, or a lattice with a linear material",
+        )
+
+
+def press_derivatives(
+    pair: "ContactPair", pose: Array, contact: "ProbedContact"
+) -> PressDerivatives:
+    """Return the derivatives of a press.
+
+    Args:
+        pair: the two bodies.
+        pose: pose of the femoral component after the press, shape (4, 4).
+        contact: the contact at this pose, with its exact tangent.
+    """
+    slopes = condyle_slopes(contact)
+    # The reaction is the force on the insert along -y.
+    reaction = -sum(
+        (one.stiffness[1] for one in contact.loads if one.stiffness is not None), np.zeros(6)
+    )
+    by_height = float(reaction[1])
+    height_by_load = 1.0 / by_height if by_height else np.nan
+    height_by_pose = -reaction * height_by_load
+    # The height of the femoral origin also changes by the displacement itself.
+    origin = np.zeros(6)
+    origin[1], origin[3], origin[5] = 1.0, -pose[2, 3], pose[0, 3]
+    by_load = np.zeros(len(PRESS_ROWS))
+    by_pose = np.zeros((len(PRESS_ROWS), 6))
+    by_load[:2], by_load[2], by_load[3] = (
+        slopes[:, 1] * height_by_load,
+        -height_by_load,
+        height_by_load,
+    )
+    by_pose[:2] = slopes + np.outer(slopes[:, 1], height_by_pose)
+    by_pose[3] = origin + height_by_pose
+    by_pose[2] = _touch_slope(pair, pose) - by_pose[3]
+    # The press determines the height, whatever it was before.
+    by_pose[:, 1] = 0.0
+    return PressDerivatives(by_load, by_pose)
+
+
+def condyle_slopes(contact: "ProbedContact") -> Array:
+    """Return the derivative (2, 6) of the condyles' forces by a displacement of the femur."""
+    slopes = np.zeros((2, 6))
+    for k, side in enumerate(SIDES):
+        if side in contact.condyles:
+            slopes[k] = contact.condyles[side].force_slope
+    return slopes
+
+
+def _touch_slope(pair: "ContactPair", pose: Array) -> Array:
+    """Return the derivative (6,) of the femoral origin's height at first touch."""
+    slope = np.zeros(6)
+    for k in (0, 2, 3, 4, 5):
+        size = TOUCH_DIFFERENCE.step / (TOUCH_DIFFERENCE.arm if k > 2 else 1.0)
+        heights = []
+        for sign in (1.0, -1.0):
+            moved = displaced(pose, sign * size * np.eye(6)[k])
+            moved[1, 3] = 0.0
+            touch = pair.first_touch.either(moved)
+            heights.append(np.nan if touch is None else -touch.travel)
+        slope[k] = (heights[0] - heights[1]) / (2.0 * size)
+    return slope
+
+
+@dataclass(frozen=True, eq=False)
+class EquilibriumDerivatives:
+    """Derivatives of an equilibrium. The eight rows are six knee coordinates and two forces.
+
+    The coordinates are those of `Equilibrium.coordinates` (m and rad), then come the forces (N) of
+    the medial and the lateral condyle.
+
+    Args:
+        by_load: by a wrench on the tibia about the insert's origin, shape (8, 6), N and N·m, in
+            addition to `external`, in the insert frame.
+        by_coordinate: by the knee coordinates that are not released, shape (8, 6), m and rad. The
+            columns of released coordinates are zero.
+        by_slack_length: by the slack length of each ligament, shape (8, m), per m.
+        by_stiffness: by the stiffness of each ligament, shape (8, m), per unit of its law.
+    """
+
+    by_load: Array
+    by_coordinate: Array
+    by_slack_length: Array
+    by_stiffness: Array
+
+
+class ImplicitEquilibrium:
+    """The equations of an equilibrium near its solution, with a linear contact.
+
+    Args:
+        search: the search that found the solution.
+        instant: the knee at its instant.
+        knee: the solution.
+        points: side -> point where an unloaded condyle is nearest to the insert.
+    """
+
+    def __init__(
+        self,
+        search: "ReleasedKnee",
+        instant: "Instant",
+        knee: "KneeEquilibrium",
+        points: dict[str, Array],
+    ) -> None:
+        self._search, self._instant, self._knee, self._points = search, instant, knee, points
+        here = [np.abs(self._forces(knee.coordinates, slack)).max() for slack in (False, True)]
+        # The search does not store whether the extensor mechanism was slack: the residual tells.
+        self._slack = bool(here[1] < here[0])
+
+    def derivatives(self) -> EquilibriumDerivatives:
+        """Return the derivatives."""
+        knee, rows = self._knee, list(self._search.released)
+        settings = EQUILIBRIUM_DIFFERENCE
+        sizes = np.full(6, settings.step)
+        sizes[3:] /= settings.arm
+        by_coordinate = self._slopes(
+            [
+                (knee.coordinates + move, knee.coordinates - move, size)
+                for move, size in zip(np.diag(sizes), sizes, strict=True)
+            ]
+        )
+        # The implicit function theorem: the released coordinates restore zero forces.
+        inverse = np.linalg.inv(by_coordinate[:, rows])
+        held = [k for k in range(6) if k not in rows]
+        held_columns = np.zeros((8, 6))
+        held_columns[:, held] = self._rows(-inverse @ by_coordinate[:, held], np.eye(6)[:, held])
+        return EquilibriumDerivatives(
+            self._rows(-inverse @ self._gain()),
+            held_columns,
+            self._rows(-inverse @ self._by_ligament("slack_length")),
+            self._rows(-inverse @ self._by_ligament("stiffness")),
+        )
+
+    def _rows(self, released: Array, held: Array | None = None) -> Array:
+        """Return the rows (8, m) of changes of the released coordinates (n, m)."""
+        knee = self._knee
+        coordinates = np.zeros((6, released.shape[1])) if held is None else held.copy()
+        coordinates[list(self._search.released)] += released
+        twists = knee_axes(knee.coordinates).T @ coordinates
+        return np.vstack([coordinates, condyle_slopes(knee.contact) @ twists])
+
+    def _slopes(self, ends: list[tuple[Array, Array, float]]) -> Array:
+        """Return the slopes (n, m) of the forces between pairs of coordinates."""
+        columns = [
+            (self._forces(ahead, self._slack) - self._forces(behind, self._slack)) / (2.0 * size)
+            for ahead, behind, size in ends
+        ]
+        return np.array(columns).T
+
+    def _by_ligament(self, name: str) -> Array:
+        """Return the slopes (n, m) of the forces by a parameter of each ligament."""
+        bundles, knee, columns = self._instant.ligaments, self._knee, []
+        for k, bundle in enumerate(bundles):
+            value, forces = getattr(bundle, name), []
+            size = 1e-6 * value
+            for sign in (1.0, -1.0):
+                changed = replace(bundle, **{name: value + sign * size})
+                others = (*bundles[:k], changed, *bundles[k + 1 :])
+                instant = replace(self._instant, ligaments=others)
+                forces.append(self._forces(knee.coordinates, self._slack, instant))
+            columns.append((forces[0] - forces[1]) / (2.0 * size))
+        return (
+            np.array(columns).reshape(len(columns), -1).T
+            if columns
+            else np.zeros((len(self._search.released), 0))
+        )
+
+    def _gain(self) -> Array:
+        """Return the slopes (n, 6) of the forces by a wrench on the tibia."""
+        joint, _ = self._joint(self._knee.coordinates, self._slack, self._instant)
+        return joint.contact_gain(self._knee.coordinates)
+
+    def _forces(self, coordinates: Array, slack: bool, instant: "Instant | None" = None) -> Array:
+        """Return the forces (n,) on the released coordinates at displaced coordinates (6,)."""
+        instant = self._instant if instant is None else instant
+        joint, contact = self._joint(coordinates, slack, instant)
+        forces = self._search.forces(instant, joint, coordinates, contact)
+        return joint.residual(coordinates, forces.wrench_at(coordinates, contact))
+
+    def _joint(
+        self, coordinates: Array, slack: bool, instant: "Instant"
+    ) -> "tuple[Any, ProbedContact]":
+        knee, patella = self._knee, None
+        change = coordinates - knee.coordinates
+        contact = moved_contact(knee.contact, knee_axes(knee.coordinates).T @ change)
+        if instant.extensor is not None:
+            patella = instant.extensor.patella(knee_pose(coordinates), knee.patella)
+        geometry = instant.geometry(coordinates, patella)
+        return self._search.joint_at(instant, geometry, contact, self._points, slack), contact
+
+
+def moved_contact(contact: "ProbedContact", displacement: Array) -> "ProbedContact":
+    """Return a contact after a small displacement (6,) of the femur, by its tangent."""
+
+    def moved(load: Any) -> Any:
+        centre = load.centre
+        if load.centre_slope is not None:
+            centre = centre + load.centre_slope @ displacement
+        return replace(load, wrench=load.wrench + load.stiffness @ displacement, centre=centre)
+
+    condyles = {side: moved(load) for side, load in contact.condyles.items()}
+    return replace(
+        contact, condyles=condyles, post=None if contact.post is None else moved(contact.post)
+    )
