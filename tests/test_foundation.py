@@ -372,6 +372,21 @@ def loop_work(probe, centre, amplitude, phase, steps):
     return work
 
 
+def test_a_small_load_is_carried_where_the_triangles_do_not_touch_yet():
+    """The smooth surface lies up to 60 µm below triangles of 8 degrees."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=20e-3)
+    femoral = Surface(ball.vertices, ball.faces, "ball")
+    pair = ContactPair(femoral, flat_insert(HEIGHT), LINEAR)
+    model, loads = LinearFoundation(0.5e-3), (0.1, 10.0, 1000.0)
+    assert 40e-6 < femoral.curved.sag < 80e-6
+    state = model.prepare(pair)
+    for angle in (0.0, 0.05, 0.1):
+        for load in loads:
+            result = model.press(state, load, knee_pose([0, 0, 0, 0, 0, angle]))
+            assert result.status is ContactStatus.OK
+            assert result.residual <= PRESS.load_tolerance
+
+
 @pytest.mark.parametrize("turning", [False, True])
 def test_the_work_over_a_closed_loop_vanishes(turning):
     """The rest is that of the midpoint rule; forces along the insert's normal leave 2 to 5 mJ."""

@@ -152,14 +152,17 @@ class ElasticFoundation(ContactModel):
         The search evaluates only the columns near the femoral component. At its end all columns are
         evaluated. If their reaction differs, the search is repeated with all columns.
         """
-        nearby = _NearColumns(self.law, state, pose, guess)
-        result = press_by_search(self, state, load, pose, guess, nearby.reaction)
+        nearby, unloaded = (
+            _NearColumns(self.law, state, pose, guess),
+            -state.pair.femoral.curved.sag,
+        )
+        result = press_by_search(self, state, load, pose, guess, nearby.reaction, unloaded)
         if result.status is ContactStatus.OK and result.residual <= PRESS.load_tolerance:
             return result
         # The near columns may lack a column in contact, so their failure has to be confirmed.
         if result.status is ContactStatus.OUT_OF_RANGE and self._load_out_of_range(nearby, load):
             return result
-        return press_by_search(self, state, load, pose, guess)
+        return press_by_search(self, state, load, pose, guess, unloaded=unloaded)
 
     def _load_out_of_range(self, nearby: "_NearColumns", load: float) -> bool:
         """Return whether all columns together go out of range before they carry the load.

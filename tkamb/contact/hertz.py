@@ -197,7 +197,7 @@ class Hertz(ContactModel):
             described = patches[side] = _described(samples, geometry.contact, patch)
             if depth >= described.thickness:
                 return ContactResult.failed(
-                    state, pose, f"the {SIDES[side]} condyle is pressed through the insert"
+                    state, pose, f"the {SIDES[side]} condyle is deeper than the insert is thick"
                 )
             if patch.long_axis > described.thickness:
                 flags.append(
