@@ -172,4 +172,5 @@ def test_contradictory_frames_of_dm_are_flagged(k):
     case, side = dm_side()
     words = contradictions(case, *side.frame(k))
     assert any("by deformation contradicts" in word for word in words)
-    assert any("carries nothing by deformation" in word for word in words)
+    alone = any("carries nothing by deformation" in word for word in words)
+    assert alone == (k != 90)  # there the lateral condyle carries 1.8 % of the load

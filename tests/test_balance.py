@@ -334,11 +334,31 @@ def test_a_condyle_lifts_off_at_zero_force_and_lands_again(flat):
         assert distance_between(loading, unloading) < 5e-6
 
 
-def test_a_knee_without_constraints_is_indeterminate(flat):
-    external = push([0, LOAD, 0])
-    start = [0, TOUCH, 0, 0, 0, 0.3]
-    *_, balance = find_equilibrium(*flat, external, start)
+def test_a_knee_without_constraints_is_indeterminate():
+    model = contact_model("hertz", resolution=1e-3)
+    flat = model, model.prepare(flat_joint())
+    *_, balance = find_equilibrium(*flat, push([0, LOAD, 0]), [0, TOUCH, 0, 0, 0, 0.3])
     assert balance.status is BalanceStatus.INDETERMINATE
+    assert balance.smallest_stiffness == pytest.approx(0.0, abs=1.0)
+
+
+def test_columns_hold_a_ball_on_a_plate_less_the_closer_they_are():
+    """Nothing holds the ball. The docstring of the foundation and docs/equilibrium.md say so."""
+    found = {}
+    for resolution in (1e-3, 2e-3):
+        model = LinearFoundation(resolution)
+        state, rng, held = model.prepare(flat_joint()), np.random.default_rng(0), []
+        for _ in range(6):
+            place = [rng.uniform(-2e-3, 2e-3), TOUCH, rng.uniform(-2e-3, 2e-3), 0, 0, 0.3]
+            held.append(model.press(state, LOAD, knee_pose(place)).wrench_on_insert[[0, 2]])
+        found[resolution] = np.sqrt(np.mean(np.square(held))) / LOAD
+    assert found[1e-3] < 1e-3
+    assert found[2e-3] < 3e-3
+    assert found[1e-3] < found[2e-3] / 2
+
+
+def test_a_knee_without_constraints_runs_away_or_does_not_settle(flat):
+    start = [0, TOUCH, 0, 0, 0, 0.3]
     *_, balance = find_equilibrium(*flat, push([20.0, LOAD, 0]), start)
     assert balance.status is BalanceStatus.RUNS_AWAY
     *_, balance = find_equilibrium(

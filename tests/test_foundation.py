@@ -1,10 +1,13 @@
 """Elastic foundation, its columns and the press, against closed forms."""
 
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
 from tkamb.contact import samples as contact_samples
@@ -19,11 +22,13 @@ from tkamb.contact.foundation import (
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import PRESS, press_by_search, search_load
+from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactStatus
-from tkamb.contact.samples import gaps_and_facets, sample_surface
+from tkamb.contact.samples import meet, sample_surface
 from tkamb.errors import InputError
 from tkamb.geometry.frames import inverse, knee_pose, pose
 from tkamb.geometry.surface import Surface
+from tkamb.knee.contact import CONTACT_DIFFERENCE, differences
 
 LINEAR = material("polyethylene-linear")
 M = LINEAR.confined_modulus
@@ -197,6 +202,22 @@ def test_loads_of_any_size_are_reached(load):
     assert result.iterations < 50
 
 
+@pytest.mark.parametrize("name", ["foundation", "foundation-linear", "hertz", "lattice-linear"])
+@pytest.mark.parametrize("depth", [10.5e-3, 25e-3, 31e-3, 50e-3, 80e-3])
+def test_a_femur_pushed_through_the_insert_is_out_of_range(name, depth):
+    """The depths run from the bottom of the insert to a femur that lies wholly below it."""
+    pair = ContactPair(graded_sphere(10e-3), flat_insert(HEIGHT), material("polyethylene"))
+    model = contact_model(name, resolution=3e-3)
+    state = model.prepare(pair)
+    at = pose(np.eye(3), [0.1e-3, HEIGHT + 10e-3 - depth, 0.1e-3])
+    result = model.evaluate(state, at)
+    assert result.status is ContactStatus.OUT_OF_RANGE
+    assert result.flags
+    assert not model.probe(state).at(at).known
+    above = pose(np.eye(3), [0.1e-3, HEIGHT + 11e-3, 0.1e-3])
+    assert model.evaluate(state, above).status is ContactStatus.OK
+
+
 def test_zero_load_is_first_touch():
     pair = sphere_on_block()
     model = LinearFoundation(1e-3)
@@ -309,9 +330,9 @@ def test_a_guess_saves_evaluations_and_does_not_change_the_result(distance, monk
 
     def counted(samples, *arguments):
         evaluations.append(len(samples.points))
-        return gaps_and_facets(samples, *arguments)
+        return meet(samples, *arguments)
 
-    monkeypatch.setattr(contact_samples, "gaps_and_facets", counted)
+    monkeypatch.setattr(contact_samples, "meet", counted)
     result = model.press(state, 1500.0, lowered(0), before)
     assert result.status is ContactStatus.OK
     assert result.residual <= PRESS.load_tolerance
@@ -330,6 +351,66 @@ def test_a_failed_guess_or_one_with_other_map_points_is_not_used():
     for guess in (failed, model.press(coarse, 1500.0, lowered(0))):
         result = model.press(state, 1500.0, lowered(0), guess)
         np.testing.assert_allclose(result.approach, alone.approach, rtol=1e-6)
+
+
+def two_dishes():
+    """Return a rounded, two-condyle component in two dishes: normals of both bodies differ."""
+    insert = dished_insert(
+        lambda x, z: 8e-3 + x**2 / (2 * 50e-3) + (np.abs(z) - 12e-3) ** 2 / (2 * 60e-3),
+        half_z=24e-3,
+        spacing=1e-3,
+    )
+    model = ElasticFoundation(2e-3)
+    return model, model.prepare(ContactPair(two_spheres(), insert, material("polyethylene")))
+
+
+def loop_work(probe, centre, amplitude, phase, steps):
+    """Return the work (J) of the contact on the femur over a closed loop of knee coordinates."""
+    turn = 2 * np.pi * np.arange(steps + 1)[:, None] / steps
+    path, work = centre + amplitude * (np.sin(turn + phase) - np.sin(phase)), 0.0
+    for start, end in pairwise(path):
+        before, middle, after = (knee_pose(x) for x in (start, (start + end) / 2, end))
+        turned = Rotation.from_matrix(after[:3, :3] @ before[:3, :3].T).as_rotvec()
+        moved = after[:3, 3] - before[:3, 3] - np.cross(turned, middle[:3, 3])
+        work -= probe.at(middle).wrench @ np.concatenate([moved, turned])
+    return work
+
+
+def test_a_small_load_is_carried_where_the_triangles_do_not_touch_yet():
+    """The smooth surface lies up to 60 µm below triangles of 8 degrees."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=20e-3)
+    femoral = Surface(ball.vertices, ball.faces, "ball")
+    pair = ContactPair(femoral, flat_insert(HEIGHT), LINEAR)
+    model, loads = LinearFoundation(0.5e-3), (0.1, 10.0, 1000.0)
+    assert 40e-6 < femoral.curved.sag < 80e-6
+    state = model.prepare(pair)
+    for angle in (0.0, 0.05, 0.1):
+        for load in loads:
+            result = model.press(state, load, knee_pose([0, 0, 0, 0, 0, angle]))
+            assert result.status is ContactStatus.OK
+            assert result.residual <= PRESS.load_tolerance
+
+
+@pytest.mark.parametrize("turning", [False, True])
+def test_the_work_over_a_closed_loop_vanishes(turning):
+    """The rest is that of the midpoint rule; forces along the insert's normal leave 2 to 5 mJ."""
+    model, state = two_dishes()
+    pressed, probe = model.press(state, 1500.0, np.eye(4)), model.probe(state)
+    amplitude = np.array([1.5e-3, 4e-5, 5e-4, 0.002, 0.02, 0.04]) * [1, 1, 1, *3 * [turning]]
+    phase = np.array([0.0, 1.3, 2.1, 0.4, 2.9, 1.0])
+    centre = np.array([0.0, pressed.pose[1, 3], 0.0, 0.0, 0.0, 0.0])
+    assert abs(loop_work(probe, centre, amplitude, phase, 400)) < 1e-4
+
+
+def test_the_stiffness_is_the_slope_of_the_wrench():
+    model, state = two_dishes()
+    pressed = model.press(state, 1500.0, knee_pose([1e-3, 0, 3e-4, 0.01, 0.0, 0.2]))
+    probe = model.probe(state)
+    stiffness = sum(load.stiffness for load in probe.at(pressed.pose).loads)
+    slope = differences(
+        lambda at: probe.at(at).wrench, pressed.pose, replace(CONTACT_DIFFERENCE, step=1e-9)
+    )
+    np.testing.assert_allclose(slope, stiffness, rtol=0, atol=1e-6 * np.abs(stiffness).max())
 
 
 def test_columns_missed_by_the_neighbourhood_are_found_by_the_final_evaluation(monkeypatch):

@@ -255,6 +255,10 @@ def test_results_have_ranges_and_the_rates_of_all_laws(written):
     first = laws["cross-shear"]["first_volume_mm3_per_Mc"]
     assert first == pytest.approx(report["volume_mm3_per_Mc"], rel=0.1)
     assert "more conforming" in laws["contact-area"]["geometry"]
+    for name in ("archard", "cross-shear"):
+        factor = material.laws[name]["wear_factor_mm3_per_Nm"]
+        assert laws[name]["wear_factor_mm3_per_Nm"] == factor
+    assert laws["contact-area"]["wear_factor_mm3_per_Nm"] is None
 
 
 def test_conformity_increases_wear_by_area_but_not_by_archard(tmp_path):

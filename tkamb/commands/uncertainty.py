@@ -155,7 +155,7 @@ def headline(uncertainty: "Uncertainty") -> list[str]:
             f"{sampled_peak['p95']:.2f}"
         )
     lines = peak_lines(uncertainty.results)
-    lines += [f"peak total force at {flexion:.0f} deg: {value} ({words})"]
+    lines += [f"peak of the resultant total force, at {flexion:.0f} deg: {value} ({words})"]
     limits = limits_line(uncertainty.results)
     lines += [limits] if limits is not None else []
     chance_share = TERMS / uncertainty.results.summary["uncertainty"]["samples"]

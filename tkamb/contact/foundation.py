@@ -13,14 +13,14 @@ from tkamb.contact.result import ContactResult, ContactStatus, Guess, WarmStart,
 from tkamb.contact.samples import (
     DEEPEST,
     NEAR,
+    Meeting,
     Neighbourhood,
     SampledContact,
     SurfaceSamples,
-    gaps_along_normals,
-    gaps_and_facets,
+    meet,
 )
 from tkamb.geometry.compiled import compiled_as_written
-from tkamb.geometry.frames import SIDES, Array, Index, Mask, inverse, rotate, transform
+from tkamb.geometry.frames import SIDES, Array, Mask
 from tkamb.units import MILLIMETRE
 
 Law = Literal["nonlinear", "linear"]
@@ -36,6 +36,10 @@ class FoundationSettings:
     approach_step: float = 1e-9
     """m: difference of two approaches below which their reactions count as equal. Chosen because
     with a stiffness of about 1e8 N/m the reactions differ by 0.1 N."""
+    least_cosine: float = 0.1
+    """1: cosine of the angle between column and femoral normal (84 deg) below which the column is
+    not loaded. Chosen like the least slope of a map point, `MAP_POINT.least_normal_y`: the force
+    p A/(m . n) would be more than ten times the pressure's."""
     reached_share: float = 0.99
     """1: a reaction below `reached_share` * load - `reached_force` cannot rise to the load within
     `approach_step`. Chosen because map points that come into contact within this step raise the
@@ -62,6 +66,12 @@ class ElasticFoundation(ContactModel):
     """A layer of local thickness h bonded to a rigid plate, pressed by a rigid body.
 
     Each column of the layer is an independent spring without lateral strain and without friction.
+    The contact stores the energy sum A W(d), with dW/dd = p. Its force is the gradient of this
+    energy: with the insert's normal n, and the normal m of the femoral component where the column
+    meets it, a column loads the insert with -p A m/(m . n), at that place. p is therefore the
+    normal traction on the femoral surface, of which the column covers A/|m . n|. The femoral
+    surface is the smooth one that the mesh approximates, `CurvedSurface`.
+
     Let d be the penetration along the insert's normal, E and nu the material's constants at zero
     strain, and sigma its uniaxial curve. With the confined modulus
 
@@ -82,9 +92,12 @@ class ElasticFoundation(ContactModel):
     p = -M ln(1 - d/h).
 
     Limits: neighbouring columns do not share load. The pressure therefore ends at the edge of the
-    overlap, and peaks at rims are too high. If the penetration is at least half of the thickness,
-    along y or along the normal, the result is OUT_OF_RANGE. Walls parallel to y carry no load. A
-    mobile bearing is pressed like a fixed one.
+    overlap, and peaks at rims are too high. The energy depends slightly on how the map points lie:
+    the map holds a ball on a plate, which nothing else holds, with 1e-4 of its normal stiffness. A
+    column that meets the femur at less than 6 deg is unloaded; there, and where an outline of the
+    femoral component passes a column, the energy jumps. If the penetration is at least half of the
+    thickness, along y or along the normal, the result is OUT_OF_RANGE. Walls parallel to y carry no
+    load. A mobile bearing is pressed like a fixed one.
 
     Args:
         resolution: m, spacing of the map points.
@@ -112,7 +125,8 @@ class ElasticFoundation(ContactModel):
         if not np.isfinite(pose).all():
             return ContactResult.out_of_range(state, pose, "the pose is not finite")
         samples = state.surface
-        gap = gaps_along_normals(samples, state.pair.femoral, pose)
+        meeting = meet(samples, state.pair.femoral, pose)
+        gap = meeting.gap
         strain = np.maximum(-gap, 0.0) / np.maximum(samples.thickness, FOUNDATION.least_thickness)
         if (deep := strain >= DEEPEST).any():
             full_depth = (samples.depth >= samples.thickness)[deep].any()
@@ -125,13 +139,18 @@ class ElasticFoundation(ContactModel):
             measured = f"{words}: {depth / MILLIMETRE:.2f} mm deep, at most {limit:.2f} mm"
             return ContactResult.out_of_range(state, pose, measured)
         pressure = layer_pressure(self.law, state.pair.material, strain)
+        pressure[grazing(samples, meeting)] = 0.0
         medial = medial_points(samples.points, pose, state.pair.split)
         sides = {"medial": medial, "lateral": ~medial}
         flags = (
             *unsupported_flags(state.pair.insert, samples.points, pressure, sides),
             *narrow_flags(samples.triangles, pressure > 0, sides, "columns"),
         )
-        return ContactResult.of(state, pose, pressure, gap, medial=medial, flags=flags)
+        force = forces_on_insert(samples, meeting, pressure)
+        places = samples.points + np.where(pressure > 0, gap, 0.0)[:, None] * samples.normals
+        return ContactResult.of(
+            state, pose, pressure, gap, force, medial=medial, places=places, flags=flags
+        )
 
     def press(
         self, state: SampledContact, load: float, pose: Array, guess: Guess | None = None
@@ -141,14 +160,17 @@ class ElasticFoundation(ContactModel):
         The search evaluates only the columns near the femoral component. At its end all columns are
         evaluated. If their reaction differs, the search is repeated with all columns.
         """
-        nearby = _NearColumns(self.law, state, pose, guess)
-        result = press_by_search(self, state, load, pose, guess, nearby.reaction)
+        nearby, unloaded = (
+            _NearColumns(self.law, state, pose, guess),
+            -state.pair.femoral.curved.sag,
+        )
+        result = press_by_search(self, state, load, pose, guess, nearby.reaction, unloaded)
         if result.status is ContactStatus.OK and result.residual <= PRESS.load_tolerance:
             return result
         # The near columns may lack a column in contact, so their failure has to be confirmed.
         if result.status is ContactStatus.OUT_OF_RANGE and self._load_out_of_range(nearby, load):
             return result
-        return press_by_search(self, state, load, pose, guess)
+        return press_by_search(self, state, load, pose, guess, unloaded=unloaded)
 
     def _load_out_of_range(self, nearby: "_NearColumns", load: float) -> bool:
         """Return whether all columns together go out of range before they carry the load.
@@ -208,24 +230,48 @@ class _NearColumns:
         pair = self.state.pair
         pose = pair.pose_at_approach(self.pose, approach)
         if approach > self._reach:
-            samples, (gap, _, _) = self._around.at(pose)
-            close = gap < NEAR
+            samples, meeting = self._around.at(pose)
+            close = meeting.gap < NEAR
             # This set of columns is used until the femur has moved down by half of NEAR. The other
             # half is a margin, because gaps along inclined normals may shrink faster.
-            self._near, self._reach, gap = samples.part(close), approach + NEAR / 2, gap[close]
+            self._near, self._reach = samples.part(close), approach + NEAR / 2
+            meeting = meeting.part(close)
         else:
-            gap = gaps_along_normals(self._near, pair.femoral, pose)
+            meeting = meet(self._near, pair.femoral, pose)
         near = self._near
-        strain = np.maximum(-gap, 0.0) / np.maximum(near.thickness, FOUNDATION.least_thickness)
+        strain = np.maximum(-meeting.gap, 0.0) / np.maximum(
+            near.thickness, FOUNDATION.least_thickness
+        )
         if (strain >= DEEPEST).any():
             self.beyond = min(self.beyond, approach)
             return np.inf
         pressure = layer_pressure(self._law, pair.material, strain)
-        # The pressure acts along the insert's normal; its y component carries the load.
-        reaction = float((pressure * near.area) @ near.normals[:, 1])
+        pressure[grazing(near, meeting)] = 0.0
+        reaction = -float(forces_on_insert(near, meeting, pressure)[:, 1].sum())
         if approach > self.within:
             self.within, self._last = approach, reaction
         return reaction
+
+
+def grazing(samples: SurfaceSamples, meeting: Meeting) -> Mask:
+    """Return whether columns (n,) meet the femoral surface edge on, or not at all."""
+    cosine = np.einsum("ij,ij->i", samples.normals, meeting.gradient)
+    return cosine > -FOUNDATION.least_cosine
+
+
+def forces_on_insert(samples: SurfaceSamples, meeting: Meeting, pressure: Array) -> Array:
+    """Return the forces (n, 3), N, of columns on the insert, -p A m/(m . n).
+
+    Args:
+        samples: the columns, with area A (n,) and normals n (n, 3).
+        meeting: the femoral surface that they meet, with normals m.
+        pressure: p (n,), Pa; 0 for a column that grazes the femoral surface.
+    """
+    forces, loaded = np.zeros_like(samples.points), pressure > 0
+    normals, met = samples.normals[loaded], meeting.gradient[loaded]
+    size = pressure[loaded] * samples.area[loaded] / np.einsum("ij,ij->i", normals, met)
+    forces[loaded] = -size[:, None] * met
+    return forces
 
 
 def layer_pressure(law: Law, material: Material, strain: Array) -> Array:
@@ -256,13 +302,15 @@ class FoundationProbe:
     """Forces and tangent stiffness of the near columns; see `tkamb.contact.model.Probe`.
 
     A column of area A starts at the point x of the insert, along the normal n. It meets the femur
-    at the point h with the femoral normal m. A displacement u of h changes the gap along n by
-    (m . u)/(m . n). With the derivative p'(d) of the pressure, the column adds
+    at the point h with the femoral normal m. Let c = m . n and M = [m; h cross m]. A displacement
+    xi = (u, w) of the femur changes the gap g by M . xi/c, so that the wrench on the insert is
 
-        A p'(d)/(m . n)  [n; x cross n] [m; h cross m]^T
+        -A p(d) M/c.
 
-    to the stiffness of the wrench on the insert. The facets of the meshes are not smoothed. The
-    stiffness is the exact tangent unless a ray crosses from facet to facet.
+    Its derivative has four terms: d changes by -M . xi/c, h moves along n by the change of g, m
+    turns by w cross m and by the femoral curvature where h slides on the femur, and c changes with
+    m. The femoral surface is that of `CurvedSurface`, whose slope jumps slightly between triangles;
+    apart from these jumps the stiffness is the exact tangent.
 
     Args:
         law: law of the layer.
@@ -274,36 +322,36 @@ class FoundationProbe:
     def __init__(self, law: Law, state: SampledContact) -> None:
         self._law, self._state = law, state
         self._around = Neighbourhood(state)
-        self._last: tuple[Array, SurfaceSamples, tuple[Array, Array, Index]] | None = None
+        self._last: tuple[Array, SurfaceSamples, Meeting] | None = None
 
     def at(self, pose: Array) -> ProbedContact:
         """Return the contact at a pose_femoral_in_insert (4, 4), with its stiffness."""
         pose = np.asarray(pose, float)
-        samples, (gap, femoral_normal, _) = self._columns(pose)
-        loaded = gap < 0
-        return self._of(samples.part(loaded), gap[loaded], femoral_normal[loaded], pose)
+        samples, meeting = self._columns(pose)
+        loaded = meeting.gap < 0
+        return self._of(samples.part(loaded), meeting.part(loaded), pose)
 
     def seen(self, result: ContactResult, start: WarmStart | None = None) -> ProbedContact:
         """Return the contact at the pose of a result, from the columns that it loads; see `at`."""
         if np.isnan(result.gap).any():
             return self.at(result.pose)
         samples = self._state.surface.part(result.gap < 0)
-        gap, femoral_normal, _ = gaps_and_facets(samples, self._state.pair.femoral, result.pose)
-        return self._of(samples, gap, femoral_normal, result.pose)
+        return self._of(samples, meet(samples, self._state.pair.femoral, result.pose), result.pose)
 
-    def _of(
-        self, samples: SurfaceSamples, gap: Array, femoral_normal: Array, pose: Array
-    ) -> ProbedContact:
-        """Return the contact of loaded columns with gaps (n,), m, and femoral normals (n, 3)."""
-        if not len(gap):
-            return ProbedContact({}, tangent=True)
-        strain = -gap / np.maximum(samples.thickness, FOUNDATION.least_thickness)
+    def _of(self, samples: SurfaceSamples, meeting: Meeting, pose: Array) -> ProbedContact:
+        """Return the contact of loaded columns."""
+        if not len(meeting.gap):
+            through = self._state.pair.passed_through(pose) is not None
+            return ProbedContact({}, known=not through, tangent=True)
+        strain = -meeting.gap / np.maximum(samples.thickness, FOUNDATION.least_thickness)
         if not (strain < DEEPEST).all():
             return ProbedContact({}, known=False)
         force = layer_pressure(self._law, self._state.pair.material, strain) * samples.area
-        rate = self._rate(samples, gap)
+        rate = self._rate(samples, meeting.gap)
+        edge_on = grazing(samples, meeting)
+        force[edge_on] = rate[edge_on] = 0.0
         condyles = {}
-        for side, sums in self._sums(samples, gap, femoral_normal, force, rate, pose).items():
+        for side, sums in self._sums(samples, meeting, force, rate, pose).items():
             if sums[0] > 0.0:
                 stiffness, centre = sums[10:46].reshape(6, 6), sums[1:4] / sums[0]
                 # The centre is sum(x F) / sum(F) over the columns.
@@ -316,29 +364,28 @@ class FoundationProbe:
 
         The stiffness of a column jumps when the column comes into contact. The transverse stiffness
         of the contact may then jump by half of its value. Here each column is weighted with the
-        share of its cell inside the edge of contact; the gap is linear across the cell. The femoral
-        normals are those of the smooth surface.
+        share of its cell inside the edge of contact; the gap is linear across the cell.
         """
-        samples, (gap, _, face) = self._columns(pose)
-        near = gap < WIDEST_EDGE
-        samples, gap, femoral = samples.part(near), gap[near], self._state.pair.femoral
-        femoral_points = transform(inverse(pose), samples.points + gap[:, None] * samples.normals)
-        normals = rotate(pose, femoral.smooth_normals(femoral_points, face[near]))
-        cosine = np.abs(np.einsum("ij,ij->i", normals, samples.normals))
+        samples, meeting = self._columns(pose)
+        near = (meeting.gap < WIDEST_EDGE) & ~grazing(samples, meeting)
+        samples, meeting = samples.part(near), meeting.part(near)
+        gap, length = meeting.gap, np.linalg.norm(meeting.gradient, axis=1)
+        cosine = np.abs(np.einsum("ij,ij->i", meeting.gradient, samples.normals)) / length
         change = samples.resolution * np.sqrt(np.maximum(1.0 - cosine**2, 0.0)) / cosine
         edge = np.clip(change, FOUNDATION.approach_step, WIDEST_EDGE)
         share = np.clip(0.5 - gap / edge, 0.0, 1.0)
-        gap = np.minimum(gap, 0.0)
-        rate = self._rate(samples, gap) * share
-        sums = self._sums(samples, gap, normals, np.zeros_like(gap), rate, pose)
+        within = replace(meeting, gap=np.minimum(gap, 0.0))
+        strain = -within.gap / np.maximum(samples.thickness, FOUNDATION.least_thickness)
+        force = layer_pressure(self._law, self._state.pair.material, strain) * samples.area
+        sums = self._sums(samples, within, force, self._rate(samples, within.gap) * share, pose)
         condyles = {
             side: replace(condyle, stiffness=sums[side][10:46].reshape(6, 6))
             for side, condyle in contact.condyles.items()
         }
         return replace(contact, condyles=condyles)
 
-    def _columns(self, pose: Array) -> tuple[SurfaceSamples, tuple[Array, Array, Index]]:
-        """Return the near columns, and their gaps and facets."""
+    def _columns(self, pose: Array) -> tuple[SurfaceSamples, Meeting]:
+        """Return the near columns, and where they meet the femoral surface."""
         if self._last is None or not np.array_equal(self._last[0], pose):
             self._last = pose.copy(), *self._around.at(pose)
         return self._last[1:]
@@ -352,8 +399,7 @@ class FoundationProbe:
     def _sums(
         self,
         samples: SurfaceSamples,
-        gap: Array,
-        femoral_normal: Array,
+        meeting: Meeting,
         force: Array,
         rate: Array,
         pose: Array,
@@ -361,7 +407,9 @@ class FoundationProbe:
         """Return the sums (`SUMS`,) over the columns of each side, see `_add_up`."""
         medial = medial_points(samples.points, pose, self._state.pair.split)
         sums = np.zeros((2, SUMS))
-        _add_up(samples.points, samples.normals, femoral_normal, gap, force, rate, medial, sums)
+        columns = samples.points, samples.normals
+        met = meeting.gradient, meeting.curvature, meeting.gap
+        _add_up(*columns, *met, force, rate, medial, sums)
         return dict(zip(SIDES, sums, strict=True))
 
 
@@ -369,7 +417,8 @@ class FoundationProbe:
 def _add_up(
     points: Array,
     normals: Array,
-    femoral_normals: Array,
+    gradients: Array,
+    curvatures: Array,
     gap: Array,
     force: Array,
     rate: Array,
@@ -381,36 +430,88 @@ def _add_up(
     Args:
         points: (n, 3) m, start of the columns on the insert.
         normals: (n, 3) unit normals of the insert at these points.
-        femoral_normals: (n, 3) unit normals of the femoral component where the columns meet it.
+        gradients: (n, 3) normals of the femoral surface where the columns meet it, of any length.
+        curvatures: (n, 3, 3) 1/m, minus the derivative of `gradients` by the place on the femur.
         gap: (n,) m.
-        force: (n,) N, force of each column.
-        rate: (n,) N/m, derivative of the force by the penetration along the insert's normal.
+        force: (n,) N, pressure times area of each column.
+        rate: (n,) N/m, derivative of `force` by the penetration along the insert's normal.
         medial: (n,) whether a column belongs to the medial condyle.
         sums: (2, `SUMS`) output for medial and lateral, to which the columns are added: force (N),
             force times point (3,) N·m, wrench on the femoral component (6,), stiffness of the
             wrench on the insert (6, 6), and of force times point (3, 6) and force (6,), by a
-            displacement.
+            displacement. Force is the magnitude of a column's force.
     """
-    push, met = np.empty(6), np.empty(6)
+    met, place, change = np.empty(6), np.empty(3), np.empty((6, 6))
     for n in range(len(points)):
-        side_sums, cosine = sums[0 if medial[n] else 1], 0.0
+        if force[n] == 0.0 and rate[n] == 0.0:
+            continue
+        side_sums, cosine, length = sums[0 if medial[n] else 1], 0.0, 0.0
         for i in range(3):
-            push[i], met[i] = normals[n, i], femoral_normals[n, i]
-            cosine += push[i] * met[i]
+            met[i] = gradients[n, i]
+            cosine += met[i] * normals[n, i]
+            length += met[i] ** 2
+            place[i] = points[n, i] + gap[n] * normals[n, i]
         for i in range(3):
             j, k = (i + 1) % 3, (i + 2) % 3
-            y, z = points[n, j], points[n, k]
-            push[3 + i] = y * push[k] - z * push[j]
-            met[3 + i] = (y + gap[n] * push[j]) * met[k] - (z + gap[n] * push[k]) * met[j]
-            side_sums[1 + i] += force[n] * points[n, i]
-        side_sums[0] += force[n]
+            met[3 + i] = place[j] * met[k] - place[k] * met[j]
+        size = -force[n] / cosine
+        weight = size * np.sqrt(length)
+        side_sums[0] += weight
+        for i in range(3):
+            side_sums[1 + i] += weight * points[n, i]
+        _turn(normals[n], curvatures[n], place, met, cosine, change)
         for i in range(6):
-            side_sums[4 + i] += force[n] * push[i]
-            for j in range(6):
-                side_sums[10 + 6 * i + j] += push[i] * met[j] * (rate[n] / cosine)
+            side_sums[4 + i] -= size * met[i]
         for j in range(6):
-            # A displacement changes the force of the column by -rate m / (m . n).
-            change = -met[j] * (rate[n] / cosine)
-            side_sums[64 + j] += change
+            turned, stretched = 0.0, 0.0  # n . dm, m . dm
+            for k in range(3):
+                turned += normals[n, k] * change[k, j]
+                stretched += met[k] * change[k, j]
+            resized = met[j] * (rate[n] / cosine**2) - size * turned / cosine
+            for i in range(6):
+                side_sums[10 + 6 * i + j] += resized * met[i] + size * change[i, j]
+            reweighed = (resized * length + size * stretched) / np.sqrt(length)
+            side_sums[64 + j] += reweighed
             for i in range(3):
-                side_sums[46 + 6 * i + j] += points[n, i] * change
+                side_sums[46 + 6 * i + j] += reweighed * points[n, i]
+
+
+@compiled_as_written
+def _turn(
+    normal: Array, curvature: Array, place: Array, met: Array, cosine: float, change: Array
+) -> None:
+    """Write the derivative (6, 6) of M = [m; h x m] by a displacement of the femoral component.
+
+    Args:
+        normal: n (3,), of the column.
+        curvature: (3, 3) 1/m, see `_add_up`.
+        place: h (3,), m.
+        met: M (6,).
+        cosine: m . n.
+        change: (6, 6) output.
+    """
+    slide, moved = np.empty(3), np.empty(3)
+    for j in range(6):
+        along = met[j] / cosine  # h moves along n as the gap changes
+        for i in range(3):
+            moved[i] = normal[i] * along
+            slide[i] = moved[i]  # motion of h on the femur: less u + w x h
+        if j < 3:
+            slide[j] -= 1.0
+        else:
+            a, b = (j - 2) % 3, (j - 1) % 3
+            # w = e_j: e_j x h has the components a: -h_b, b: h_a.
+            slide[a] += place[b]
+            slide[b] -= place[a]
+        for i in range(3):
+            change[i, j] = 0.0
+            for k in range(3):
+                change[i, j] -= curvature[i, k] * slide[k]
+        if j >= 3:
+            a, b = (j - 2) % 3, (j - 1) % 3
+            change[a, j] -= met[b]
+            change[b, j] += met[a]
+        for i in range(3):
+            a, b = (i + 1) % 3, (i + 2) % 3
+            change[3 + i, j] = place[a] * change[b, j] - place[b] * change[a, j]
+            change[3 + i, j] += moved[a] * met[b] - moved[b] * met[a]

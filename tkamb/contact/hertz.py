@@ -197,6 +197,10 @@ class Hertz(ContactModel):
                     state, pose, f"{SIDES[side]} contact ellipse leaves the insert"
                 )
             described = patches[side] = _described(samples, geometry.contact, patch)
+            if depth >= described.thickness:
+                return ContactResult.out_of_range(
+                    state, pose, f"the {SIDES[side]} condyle is deeper than the insert is thick"
+                )
             if patch.long_axis > described.thickness:
                 flags.append(
                     f"the long semi-axis of the {SIDES[side]} contact ellipse exceeds the "

@@ -247,6 +247,6 @@ def condyle_wrenches(result: ContactResult, split: float | None) -> dict[str, Co
         if chosen.any():
             weight = magnitude[chosen]
             centre = weight @ result.points[chosen] / weight.sum()
-            wrench = wrench_of(result.points[chosen], result.nodal_force[chosen])
+            wrench = wrench_of(result.places[chosen], result.nodal_force[chosen])
             wrenches[side] = CondyleWrench(wrench, centre)
     return wrenches

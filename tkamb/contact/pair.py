@@ -14,11 +14,16 @@ from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.first_touch import FirstTouch, Touch
 from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.surface import Surface
+from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.geometry.closest import ClosestPointQuery
 
 Bearing = Literal["fixed", "mobile"]
+
+MAX_UNLOADED_APPROACH = 0.5 * MILLIMETRE
+"""m: approach above which a contact without load is out of range. Chosen because a sphere of 20 mm
+touches between map points of 3 mm up to an approach of 0.06 mm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +95,20 @@ class ContactPair:
         """Return the travel along -y since first touch (m) at a pose; 0 when apart."""
         depth = self.first_touch_height(pose) - float(pose[1, 3])
         return depth if depth > 0 else 0.0
+
+    def passed_through(self, pose: Array) -> str | None:
+        """Return the words for an unloaded contact that lies far beyond first touch; else None.
+
+        A model whose columns or cells lie inside or above the femoral component finds no contact
+        there.
+        """
+        approach = self.approach(pose)
+        if approach <= MAX_UNLOADED_APPROACH:
+            return None
+        return (
+            f"the femoral component lies {approach / MILLIMETRE:.1f} mm below first touch, but "
+            "nothing is loaded: it is pushed through the insert or lies below it"
+        )
 
     def pose_at_approach(self, pose: Array, approach: float) -> Array:
         """Return the pose moved along y to an approach (m)."""

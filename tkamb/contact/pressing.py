@@ -109,6 +109,7 @@ def press_by_search(
     pose: Array,
     guess: Guess | None = None,
     reaction: Reaction | None = None,
+    unloaded: float = 0.0,
 ) -> ContactResult:
     """Find the approach along -y at which `model` carries `load`.
 
@@ -122,6 +123,7 @@ def press_by_search(
         guess: earlier result or warm start; its approach is the initial guess of the search.
         reaction: function that returns the reaction (N) at an approach (m), faster than `evaluate`;
             inf if out of range. The reaction is the force on the insert along -y.
+        unloaded: m, see `search_load`.
 
     Returns:
         The contact at the approach that carries the load. It is OUT_OF_RANGE, with NaN, if the load
@@ -139,7 +141,7 @@ def press_by_search(
         return unloaded_result(model, state, pose)
     evaluations = _Evaluations(model, state, pose, guess)
     start = guess.approach if guess is not None else PRESS.first_approach
-    search = search_load(reaction or evaluations.reaction, load, start)
+    search = search_load(reaction or evaluations.reaction, load, start, unloaded)
     if not math.isfinite(search.approach):
         why = evaluations.at(search.deepest).flags
         problem = f"a load of {load:g} N cannot be reached"
@@ -200,23 +202,25 @@ class _Evaluations:
         return force if in_range else math.inf
 
 
-def search_load(reaction: Reaction, load: float, start: float) -> LoadSearch:
+def search_load(reaction: Reaction, load: float, start: float, unloaded: float = 0.0) -> LoadSearch:
     """Find the approach at which a rising reaction equals the load.
 
     The trial approach grows from `start` until the load is bracketed. False position (Illinois)
     then narrows the bracket.
 
     Args:
-        reaction: function that returns the reaction (N) at an approach (m): 0 at 0, inf if the
-            approach is out of range.
+        reaction: function that returns the reaction (N) at an approach (m): 0 at `unloaded`, inf if
+            the approach is out of range.
         load: N, positive.
         start: m, initial guess of the approach.
+        unloaded: m, an approach without reaction. It is negative for a model of smooth surfaces,
+            which may overlap where the triangles first touch.
     """
     # The square root of the reaction is nearly linear in the approach (F ~ d^2 for a sphere on a
     # layer, d^1.5 on a half-space), so that false position converges fast.
     target = math.sqrt(load)
     trial = start if 0 < start < PRESS.max_approach else PRESS.first_approach
-    low, low_value, high, high_value = 0.0, -target, math.nan, math.nan
+    low, low_value, high, high_value = unloaded, -target, math.nan, math.nan
     best, deepest, last_side, count = (math.inf, math.nan), 0.0, 0, 0
     while count < PRESS.max_evaluations:
         force, deepest, count = reaction(trial), max(deepest, trial), count + 1

@@ -87,6 +87,8 @@ class ContactResult:
         area: (n,) m², tributary area of each point on the true surface, not projected.
         gap: (n,) m, positive when apart.
         nodal_force: (n, 3) N on the insert.
+        places: (n, 3) m, where the nodal forces act: the map points, or the points of the femoral
+            component that the columns of a foundation meet.
         wrench_on_insert: (6,) force (N) and moment about the insert origin (N·m).
         medial: contact of the medial (or only) condyle; None if it is unloaded.
         lateral: contact of the lateral condyle; None if it is unloaded or does not exist.
@@ -104,6 +106,7 @@ class ContactResult:
     area: Array
     gap: Array
     nodal_force: Array
+    places: Array
     wrench_on_insert: Array
     medial: CondyleContact | None
     lateral: CondyleContact | None
@@ -154,6 +157,7 @@ class ContactResult:
         area: Array | None = None,
         covered: Array | None = None,
         medial: Mask | None = None,
+        places: Array | None = None,
         **ending: Any,
     ) -> "ContactResult":
         """Return the result of a pressure map.
@@ -171,6 +175,7 @@ class ContactResult:
             covered: (n,) m², area in contact around each point, for the condyles' areas; by default
                 `area`.
             medial: (n,) whether a point is under the medial condyle; by default `medial_points`.
+            places: (n, 3) m, where the nodal forces act; by default the map points.
             ending: status, iterations, residual and flags of the result.
         """
         surface, pose = state.surface, np.array(pose, float)
@@ -178,11 +183,14 @@ class ContactResult:
             return cls.out_of_range(
                 state, pose, "the femoral component lies too deep in the insert"
             )
+        if not pressure.any() and (passed := state.pair.passed_through(pose)):
+            return cls.out_of_range(state, pose, passed)
         area = surface.area if area is None else area
         if nodal_force is None:
             nodal_force = -(pressure * area)[:, None] * surface.normals
         if medial is None:
             medial = medial_points(surface.points, pose, state.pair.split)
+        places = surface.points if places is None else places
         sums = (surface.points, pressure, area if covered is None else covered, nodal_force)
         loaded = pressure > 0
         sides = {
@@ -215,7 +223,8 @@ class ContactResult:
             area=area,
             gap=gap,
             nodal_force=nodal_force,
-            wrench_on_insert=wrench_of(surface.points, nodal_force),
+            places=places,
+            wrench_on_insert=wrench_of(places, nodal_force),
             medial=sides["medial"],
             lateral=sides["lateral"],
             **ending,
@@ -251,6 +260,7 @@ class ContactResult:
             area=unknown,
             gap=unknown,
             nodal_force=vectors,
+            places=vectors,
             wrench_on_insert=np.full(6, np.nan),
             medial=None,
             lateral=None,

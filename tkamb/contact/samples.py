@@ -119,20 +119,37 @@ def gaps_along_normals(samples: SurfaceSamples, femoral: Surface, pose: Array) -
     femoral component may be. A penetration counts there only if the surface point lies inside the
     femoral component, too.
     """
-    return _gaps(samples, femoral, inverse(pose))[0]
+    return meet(samples, femoral, pose).gap
 
 
-def gaps_and_facets(
-    samples: SurfaceSamples, femoral: Surface, pose: Array
-) -> tuple[Array, Array, Index]:
-    """Return the gaps (n,), m, and the femoral facets that the columns meet.
+@dataclass(frozen=True, eq=False)
+class Meeting:
+    """The points of the smooth femoral surface that columns meet.
 
-    Returns:
-        Gap (n,), see `gaps_along_normals`; unit normals (n, 3) of the facets, insert frame; facets
-        (n,).
+    Args:
+        gap: (n,) m, along the insert's normals, see `gaps_along_normals`.
+        gradient: (n, 3) outward normals of the femoral surface, insert frame; their length is
+            about 1, and 0 where a column meets nothing.
+        curvature: (n, 3, 3) 1/m, minus the derivative of `gradient` by the place on the femur.
     """
-    gap, face = _gaps(samples, femoral, inverse(pose))
-    return gap, rotate(pose, femoral.face_normals[face]), face
+
+    gap: Array
+    gradient: Array
+    curvature: Array
+
+    def part(self, chosen: Mask | Index) -> "Meeting":
+        """Return the chosen points, by mask or index."""
+        return Meeting(self.gap[chosen], self.gradient[chosen], self.curvature[chosen])
+
+
+def meet(samples: SurfaceSamples, femoral: Surface, pose: Array) -> Meeting:
+    """Return where columns meet the smooth surface that the femoral mesh approximates."""
+    back = inverse(pose)
+    gap, face = _gaps(samples, femoral, back)
+    origins, directions = transform(back, samples.points), rotate(back, samples.normals)
+    gradient, curvature = femoral.curved.cross(face, origins, directions, gap)
+    turn = np.asarray(pose)[:3, :3]
+    return Meeting(gap, rotate(pose, gradient), turn @ curvature @ turn.T)
 
 
 def _gaps(samples: SurfaceSamples, femoral: Surface, back: Array) -> tuple[Array, Index]:
@@ -338,20 +355,18 @@ class Neighbourhood:
         """Store the gaps (n,) of all columns at a pose (4, 4)."""
         self._gap, self._last_position = np.minimum(gap, FARTHEST), self._places(pose)
 
-    def at(self, pose: Array) -> tuple[SurfaceSamples, tuple[Array, Array, Index]]:
-        """Return the near columns at a pose (4, 4), and the results of `gaps_and_facets`."""
+    def at(self, pose: Array) -> tuple[SurfaceSamples, Meeting]:
+        """Return the near columns at a pose (4, 4), and where they meet the femoral surface."""
         near, places = np.empty(len(self._gap), np.int64), np.empty_like(self._last_position)
         number = _near(
             self._bed.points, inverse(pose), self._last_position, self._gap, near, places
         )
         near = near[:number]
         columns = self._bed.part(near)
-        gaps = gaps_and_facets(columns, self._femoral, pose)
-        self._gap[near], self._last_position[near] = (
-            np.minimum(gaps[0], FARTHEST),
-            places[:number],
-        )
-        return columns, gaps
+        meeting = meet(columns, self._femoral, pose)
+        self._gap[near] = np.minimum(meeting.gap, FARTHEST)
+        self._last_position[near] = places[:number]
+        return columns, meeting
 
     def _places(self, pose: Array) -> Array:
         return transform(inverse(pose), self._bed.points)

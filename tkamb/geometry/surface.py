@@ -12,6 +12,7 @@ from tkamb.geometry.topology import Ragged, edge_use, same_places
 if TYPE_CHECKING:
     import trimesh
 
+    from tkamb.geometry.curved import CurvedSurface
     from tkamb.geometry.defects import Defect
     from tkamb.geometry.nearest import NearestPoints, TriangleTree
     from tkamb.geometry.rays import RayCaster
@@ -170,6 +171,13 @@ class Surface:
         """
         weights = self.barycentric(points, faces)
         return _mean_normals(weights, self._smooth_corner_normals[faces])
+
+    @cached_property
+    def curved(self) -> "CurvedSurface":
+        """The smooth surface that the triangles approximate."""
+        from tkamb.geometry.curved import CurvedSurface
+
+        return CurvedSurface.of(self)
 
     @cached_property
     def tree(self) -> "TriangleTree":

@@ -208,7 +208,9 @@ COLUMNS: tuple[Column, ...] = (
             ("slip", "rate of <side>_slip_mm; positive: the femur slides forwards", _SLIP),
             (
                 "sliding",
-                "sliding velocity from the rigid-body velocity at the <side> contact point",
+                "forward sliding velocity (insert x) at the <side> contact point: the rigid-body "
+                "velocity without the part of axial rotation about the component's centre; "
+                "positive: the femur slides forwards",
                 _PRESSED,
             ),
             (

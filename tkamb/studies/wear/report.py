@@ -17,6 +17,7 @@ from tkamb.geometry.surface import Surface
 from tkamb.io.vtk import write_triangles
 from tkamb.run.results_folder import remove_shards
 from tkamb.studies.wear.bands import WearBands
+from tkamb.studies.wear.laws import WearLaw
 from tkamb.studies.wear.materials import WearMaterial
 from tkamb.studies.wear.setup import WearSetup
 from tkamb.studies.wear.simulation import CycleWear, FirstCycle, WearCase, WearState
@@ -178,6 +179,7 @@ class WearReport:
             result.append(
                 {
                     "law": name,
+                    "wear_factor_mm3_per_Nm": _single_factor(law),
                     "first_volume_mm3_per_Mc": rate,
                     "first_volume_mm3_per_Mc_range": [f * rate for f in self.material.factor_range],
                     "law_parameters": vars(law),
@@ -230,15 +232,29 @@ class WearReport:
             questions.append("creep is not modelled: the material gives no [creep]")
         return questions
 
+    def _own_factor(self, laws: list[dict[str, Any]]) -> list[str]:
+        """Return a line if the simulated law has another wear factor than the material's laws."""
+        own = _single_factor(self.case.law)
+        others = {law["law"]: law["wear_factor_mm3_per_Nm"] for law in laws}
+        name = self.case.law.name
+        if own is None or others.get(name, own) == own:
+            return []
+        return [
+            f"wear factor of the simulation {own:.3g} mm3/(N m); the laws side by side have the "
+            "factors of the material, which stand beside them"
+        ]
+
     def lines(self) -> list[str]:
         """Return the report as lines of text."""
         result = self.as_dict()
         creep = result["creep_depth_mm"]
         text = "not modelled" if creep is None else f"{creep:.4g} mm deep"
+        own = self._own_factor(result["laws_side_by_side"])
         low, high = result["volume_mm3_range"]
         slow, fast = result["volume_mm3_per_Mc_range"]
         others = [
-            f"{law['law']} {law['first_volume_mm3_per_Mc']:.3g} "
+            f"{law['law']} {_factor_words(law['wear_factor_mm3_per_Nm'])}"
+            f"{law['first_volume_mm3_per_Mc']:.3g} "
             f"({law['first_volume_mm3_per_Mc_range'][0]:.3g} to "
             f"{law['first_volume_mm3_per_Mc_range'][1]:.3g})"
             for law in result["laws_side_by_side"]
@@ -247,6 +263,7 @@ class WearReport:
             FIRST,
             f"{result['cycles']:.6g} cycles in {result['blocks']} blocks, {result['law']}, "
             f"{result['material']}: {result['status']}",
+            *own,
             f"worn volume {result['volume_mm3']:.4g} mm3, {result['mass_mg']:.4g} mg, "
             f"{result['max_depth_mm']:.4g} mm deep at most, over {result['worn_area_mm2']:.4g} mm2",
             f"rate {self.rate:.4g} mm3 per million cycles; creep {text}",
@@ -395,3 +412,13 @@ def draw_volume(axes: "Axes", rows: Sequence[Mapping[str, float]]) -> None:
         axes.plot(cycles, middle, "k:", label="median of the samples")
         axes.legend()
     axes.set(title="worn volume, mm³", xlabel="million cycles", xlim=(0, None), ylim=(0, None))
+
+
+def _single_factor(law: WearLaw) -> float | None:
+    """Return the wear factor of a law, mm³/(N m); None if it has none or a table of them."""
+    factor = getattr(law, "wear_factor_mm3_per_Nm", None)
+    return factor if isinstance(factor, float) else None
+
+
+def _factor_words(factor: float | None) -> str:
+    return "" if factor is None else f"with k = {factor:.3g}: "
