@@ -1,4 +1,4 @@
-"""Some abusive inputs of scripts/study_abuse and scripts/fuzz_http do no damage."""
+"""Some abusive inputs of scripts/study/abuse and scripts/study/fuzz_http do no damage."""
 
 import subprocess
 import sys
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-SCRIPTS = Path(__file__).parents[1] / "scripts"
+SCRIPTS = Path(__file__).parents[1] / "scripts" / "study"
 
 
 @pytest.mark.parametrize(
@@ -15,7 +15,7 @@ SCRIPTS = Path(__file__).parents[1] / "scripts"
 def test_abusive_inputs_break_nothing(inputs, seed):
     command = [
         sys.executable,
-        SCRIPTS / "study_abuse",
+        SCRIPTS / "abuse",
         "--inputs",
         str(inputs),
         "--seed",
