@@ -5,9 +5,17 @@ import signal
 import pytest
 
 import headless
+from shared_surfaces import shared_surfaces
 
 # Without this, tests in the background of a shell and their child processes would ignore SIGINT.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def implants():
+    """Read the implants of the shipped knee once."""
+    with shared_surfaces():
+        yield
 
 
 @pytest.fixture(scope="session")
