@@ -18,6 +18,16 @@ def implants():
         yield
 
 
+@pytest.fixture(scope="module")
+def plain_report():
+    """Replace the report of a run, which takes as long to draw as fifty frames take to compute."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            "tkamb.show.report.report_html", lambda results, progress=None: "<html></html>"
+        )
+        yield
+
+
 @pytest.fixture(scope="session")
 def chromium():
     """Return one browser for all tests."""

@@ -22,6 +22,8 @@ from tkamb.run.press import PressReport
 from tkamb.run.results_folder import read_results
 from tkamb.run.simulation import simulate
 
+pytestmark = pytest.mark.usefixtures("plain_report")
+
 ROOT = Path(__file__).parents[1]
 MESHES = [str(MODEL / name) for name in ("femoral_component.stl", "insert.stl")]
 

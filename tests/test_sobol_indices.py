@@ -14,6 +14,8 @@ from tkamb.studies.uncertainty.run import estimate_uncertainty
 from tkamb.studies.uncertainty.sampling import crossed_points, noise, noise_of_point, normal_samples
 from tkamb.studies.uncertainty.sensitivity import Screened, screen, screen_lines, sobol_indices
 
+pytestmark = pytest.mark.usefixtures("plain_report")
+
 A, B = 7.0, 0.1
 
 
@@ -117,7 +119,6 @@ def knee_with_varied_loads():
 
 
 def test_first_order_and_total_index_agree_for_additive_loads(tmp_path, monkeypatch):
-    monkeypatch.setattr("tkamb.show.report.report_html", lambda results, progress=None: "page")
     folder = tmp_path / "out"
     analysis = estimate_uncertainty(
         knee_with_varied_loads(),

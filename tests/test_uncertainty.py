@@ -29,6 +29,8 @@ from tkamb.studies.uncertainty.run import estimate_uncertainty, write_uncertaint
 from tkamb.studies.uncertainty.sample import Sampler
 from tkamb.studies.uncertainty.sampling import Point, noise, normal_samples
 
+pytestmark = pytest.mark.usefixtures("plain_report")
+
 SCENE = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
 SLOPES = np.array([3.0, -2.0, 1.0, 0.5])
 LINEAR_SD = float(np.linalg.norm(SLOPES))
@@ -272,7 +274,6 @@ def test_a_folder_in_use_is_refused(tmp_path):
 
 def test_a_full_disk_leaves_all_files_or_none(tmp_path, monkeypatch):
     uncertainty = estimate_uncertainty(bodies_alone(), samples=20, frames=slice(0, 1))
-    monkeypatch.setattr("tkamb.show.report.report_html", lambda results, progress=None: "page")
 
     def write(folder, number=None):
         folder.mkdir()
