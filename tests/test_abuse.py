@@ -1,5 +1,6 @@
 """Some abusive inputs of scripts/study/abuse and scripts/study/fuzz_http do no damage."""
 
+import logging
 import subprocess
 import sys
 from importlib.machinery import SourceFileLoader
@@ -22,6 +23,7 @@ def script(name):
 def test_some_abusive_inputs_break_nothing(tmp_path, monkeypatch):
     """One input of each kind, in this process. The script and the slow test try many, in others."""
     abuse = script("abuse")
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])  # the script redirects them
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("TKAMB_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setattr("tkamb.show.report.report_html", lambda results, progress=None: "<html/>")
