@@ -1,57 +1,91 @@
-"""The implants of the shipped knee, read once for all tests of a process.
+"""Surfaces that all tests of a process share.
 
-Reading them, finding the insert frame and building search trees takes as long as ten frames. A mesh
-with another content is read as usual.
+Reading a mesh, repairing it and building its search trees takes as long as many frames. A mesh with
+the same content, read with the same options, is therefore the same `Surface`, and so is its copy in
+another frame. A mesh that is read with a warning or an error is read again each time.
 """
 
 import hashlib
+import inspect
+import logging
+from collections import OrderedDict
 from contextlib import contextmanager
-from functools import cache, wraps
+from pathlib import Path
 
 import pytest
 
-from scenes import MODEL
-from tkamb.io.scene.parts import ImplantParts
+from tkamb.geometry.surface import Surface
+from tkamb.io import mesh_files
+from tkamb.io.importing import patient
+from tkamb.io.recordings import meshes
+from tkamb.run import press
+
+MOST = 24
+"""Number of meshes whose surfaces are kept."""
+MOST_POSES = 4
+"""Number of poses in which a surface is kept."""
 
 
-@cache
-def shipped():
-    """Return the SHA-256 of the shipped meshes."""
-    return {_digest(path) for path in MODEL.glob("*.stl")}
+class _Records(logging.Handler):
+    """Counts the records of the logger."""
 
+    count = 0
 
-def _digest(path):
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    def emit(self, record):
+        self.count += 1
 
 
 @contextmanager
 def shared_surfaces():
-    """Let scenes with equal tables of a shipped mesh share its surface while the block runs."""
-    places = {"_place": lambda name, table: table, "_place_insert": lambda s: s.implant.insert}
+    """Share surfaces of meshes with the same content while the block runs."""
     with pytest.MonkeyPatch.context() as patch:
-        for method, table_of in places.items():
-            patch.setattr(ImplantParts, method, _shared(getattr(ImplantParts, method), table_of))
+        load = _loading(meshes.load_surface)
+        for module in (meshes, press, mesh_files, patient):
+            patch.setattr(module, "load_surface", load)
+        patch.setattr(Surface, "moved", _moving(Surface.moved))
         yield
 
 
-def _shared(place, table_of):
-    """Return a method of `ImplantParts` that remembers its result and the attributes it sets."""
-    results = {}
+def _loading(load):
+    """Return `load_surface` with a store of its surfaces."""
+    store, options = OrderedDict(), inspect.signature(load)
 
-    @wraps(place)
-    def remembered(parts, *arguments):
-        table = table_of(*arguments)
-        digest = _digest(table.mesh) if table.mesh.is_file() else None
-        if digest not in shipped():
-            return place(parts, *arguments)
-        key = (digest, table.model_dump_json(exclude={"mesh"}), parts._left)
-        if key not in results:
-            before = dict(vars(parts))
-            surface = place(parts, *arguments)
-            changed = {k: v for k, v in vars(parts).items() if v is not before.get(k)}
-            results[key] = surface, changed
-        surface, changed = results[key]
-        vars(parts).update(changed)
+    def shared(path, *arguments, **named):
+        given = options.bind(path, *arguments, **named).arguments
+        if not Path(path).is_file():
+            return load(path, *arguments, **named)
+        content = hashlib.sha256(Path(path).read_bytes()).hexdigest()
+        key = (content, Path(path).suffix, *(repr(v) for k, v in given.items() if k != "path"))
+        if key in store:
+            store.move_to_end(key)
+            return store[key]
+        logging.getLogger("tkamb").addHandler(records := _Records(logging.INFO))
+        try:
+            surface = load(path, *arguments, **named)
+        finally:
+            logging.getLogger("tkamb").removeHandler(records)
+        if not records.count:
+            surface.__dict__["poses"] = OrderedDict()
+            store[key] = surface
+            while len(store) > MOST:
+                store.popitem(last=False)
         return surface
 
-    return remembered
+    return shared
+
+
+def _moving(move):
+    """Return `Surface.moved` with a store of the copies of shared surfaces."""
+
+    def shared(surface, pose):
+        poses = surface.__dict__.get("poses")
+        if poses is None:
+            return move(surface, pose)
+        key = pose.tobytes()
+        if key not in poses:
+            poses[key] = move(surface, pose)
+            while len(poses) > MOST_POSES:
+                poses.popitem(last=False)
+        return poses[key]
+
+    return shared
