@@ -12,10 +12,16 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session", autouse=True)
-def implants():
-    """Read the implants of the shipped knee once."""
-    with shared_surfaces():
-        yield
+def surfaces():
+    """Share surfaces of meshes with the same content."""
+    with shared_surfaces() as store:
+        yield store
+
+
+@pytest.fixture
+def fresh_surfaces(surfaces):
+    """Read all meshes again in a test that counts what is computed once for a mesh."""
+    surfaces.clear()
 
 
 @pytest.fixture(scope="module")

@@ -37,18 +37,19 @@ class _Records(logging.Handler):
 
 @contextmanager
 def shared_surfaces():
-    """Share surfaces of meshes with the same content while the block runs."""
+    """Share surfaces of meshes with the same content while the block runs; yield their store."""
+    store = OrderedDict()
     with pytest.MonkeyPatch.context() as patch:
-        load = _loading(meshes.load_surface)
+        load = _loading(meshes.load_surface, store)
         for module in (meshes, press, mesh_files, patient):
             patch.setattr(module, "load_surface", load)
         patch.setattr(Surface, "moved", _moving(Surface.moved))
-        yield
+        yield store
 
 
-def _loading(load):
+def _loading(load, store):
     """Return `load_surface` with a store of its surfaces."""
-    store, options = OrderedDict(), inspect.signature(load)
+    options = inspect.signature(load)
 
     def shared(path, *arguments, **named):
         given = options.bind(path, *arguments, **named).arguments

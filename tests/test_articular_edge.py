@@ -34,7 +34,7 @@ def with_eminence():
 
 
 def flags(insert, x, z, radius=20 * MM, load=150.0):
-    chosen = contact_model("foundation-linear", 1.0)
+    chosen = contact_model("foundation-linear", resolution=1e-3)
     pair = ContactPair(graded_sphere(radius), insert, LINEAR)
     result = chosen.press(chosen.prepare(pair), load, pose(np.eye(3), [x, 0, z]))
     return [flag for flag in result.flags if "edge of the insert" in flag]
@@ -42,7 +42,9 @@ def flags(insert, x, z, radius=20 * MM, load=150.0):
 
 @pytest.mark.parametrize("model", ["foundation-linear", "lattice-linear", "hertz"])
 def test_contact_near_the_edge_is_flagged(model):
-    chosen = contact_model(model, 1.0, **({"cache": False} if model.startswith("lat") else {}))
+    chosen = contact_model(
+        model, resolution=1e-3, **({"cache": False} if model.startswith("lat") else {})
+    )
     pair = ContactPair(graded_sphere(20 * MM), flat_insert(8 * MM), LINEAR)
     state = chosen.prepare(pair)
 

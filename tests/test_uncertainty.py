@@ -279,7 +279,7 @@ def test_a_full_disk_leaves_all_files_or_none(tmp_path, monkeypatch):
         folder.mkdir()
         injected = Faults(folder, number).injected(monkeypatch)
         with injected as faults, suppress(InputError):
-            write_uncertainty(uncertainty, folder)
+            write_uncertainty(uncertainty, folder, report=lambda results: "page")
         settle(folder)
         expected = {"bands.csv", "tornado.csv", "samples.h5", "results.csv", "summary.json"}
         return faults.calls, expected, expected & {path.name for path in folder.iterdir()}
