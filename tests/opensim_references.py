@@ -14,7 +14,7 @@ import numpy as np
 
 ROOT = Path(__file__).parents[1]
 WEIGHTS = np.sin(1.0 + np.arange(12.0)).reshape(3, 4)
-"""Weights of the (3, 4) entries of a pose in its checksum, as in make_opensim_references."""
+"""Weights of the (3, 4) entries of a pose, as in scripts/make/opensim_references."""
 
 
 @cache
@@ -25,6 +25,6 @@ def references() -> dict:
         return json.loads((ROOT / "tests" / "data" / "opensim_references.json").read_text())
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "references.json"
-        script = ROOT / "scripts" / "make_opensim_references"
+        script = ROOT / "scripts" / "make" / "opensim_references"
         subprocess.run([python, str(script), str(out), "--sets", "50"], check=True)
         return json.loads(out.read_text())

@@ -8,6 +8,8 @@ import tkamb
 from tkamb.cli import main
 from tkamb.errors import InputError
 
+pytestmark = pytest.mark.usefixtures("plain_report")
+
 SCENE = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
 CASES = (
     ({"frames": slice(90, 200)}, ["--frames", "90:200"], "frames: ", "--frames: "),

@@ -9,6 +9,8 @@ import trimesh
 from scenes import MODEL, write_scene
 from tkamb.cli import main
 
+pytestmark = pytest.mark.usefixtures("plain_report")
+
 
 def refused(capfd, *arguments):
     """Run a command that must refuse its input, and return its one line on stderr."""

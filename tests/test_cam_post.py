@@ -30,6 +30,8 @@ from tkamb.run.tabulate import frame_row
 from tkamb.studies.designs.design import CAM_MESH, INSERT_MESH, load_design
 from tkamb.units import MILLIMETRE
 
+pytestmark = pytest.mark.usefixtures("plain_report")
+
 DESIGN = load_design(Path(__file__).parents[1] / "models" / "designs" / "lps_flex")
 LINEAR, CURVED = material("polyethylene-linear"), material("polyethylene")
 RADIUS, LENGTH, DEPTH, TALL = 15e-3, 14e-3, 10e-3, 16e-3

@@ -1,4 +1,4 @@
-"""`scripts/census_recordings`: files that are read, partly read or refused, and differences."""
+"""`census_recordings`: files that are read, partly read or refused, and differences."""
 
 import json
 import subprocess
@@ -11,7 +11,7 @@ import trimesh
 from pendulum_leg import pendulum_osim
 from recordings import standing_markers, write_c3d
 
-SCRIPT = Path(__file__).parents[1] / "scripts" / "census_recordings"
+SCRIPT = Path(__file__).parents[1] / "scripts" / "study" / "census_recordings"
 
 
 def test_a_census_classifies_files(tmp_path):

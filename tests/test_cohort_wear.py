@@ -11,6 +11,8 @@ from tkamb.cli import main
 from tkamb.studies.cohort.outcome import Outcome
 from wear_bodies import balls_scene
 
+pytestmark = pytest.mark.usefixtures("plain_report")
+
 
 @pytest.fixture(scope="module")
 def cohort(tmp_path_factory):

@@ -34,6 +34,8 @@ from tkamb.studies.cohort.plan import load_cohort
 from tkamb.studies.measures import Job
 from tkamb.testing import ConformanceError, check_contact_model
 
+pytestmark = pytest.mark.usefixtures("plain_report")
+
 PLUGIN = Path(__file__).parent / "plugin"
 COARSE = 2.0
 """mm: resolution of volume models. Chosen because the conformance test needs no finer grid."""

@@ -19,6 +19,8 @@ from tkamb.run.results_folder import read_results
 from tkamb.run.simulation import simulate
 from tkamb.studies.calculix import peer_result, run_calculix
 
+pytestmark = pytest.mark.usefixtures("plain_report")
+
 COARSE_MM = 4.0
 WITH_CALCULIX = pytest.mark.skipif(shutil.which("ccx") is None, reason="CalculiX is not installed")
 

@@ -21,11 +21,11 @@ MODEL = ROOT / "models" / "deep_knee_bend"
 MESHES = ("femoral_component", "insert", "patellar_button")
 WEIGHT, HEIGHT = 75.0 * 9.80665, 1.75
 
-sys.path.insert(0, str(ROOT / "scripts"))
+sys.path.insert(0, str(ROOT / "scripts" / "make"))
 
-from deep_knee_bend import comparison, model  # noqa: E402
-from deep_knee_bend import dimensions as d  # noqa: E402
-from deep_knee_bend.implant import FEMORAL, INSERT  # noqa: E402
+from knee_bend import comparison, model  # noqa: E402
+from knee_bend import dimensions as d  # noqa: E402
+from knee_bend.implant import FEMORAL, INSERT  # noqa: E402
 
 PROFILE = FEMORAL.profile
 

@@ -12,6 +12,8 @@ from tkamb.cli import main
 from tkamb.io.recordings.tables import read_table
 from tkamb.run.results_folder import write_results
 
+pytestmark = pytest.mark.usefixtures("plain_report")
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):

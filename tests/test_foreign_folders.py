@@ -12,7 +12,7 @@ import pytest
 from scenes import MODEL
 from tkamb.cli import main
 
-sys.path.append(str(Path(__file__).parents[1] / "scripts"))
+sys.path.append(str(Path(__file__).parents[1] / "scripts" / "study"))
 
 from forged_folders import SECRET, _rehash
 

@@ -30,7 +30,7 @@ def test_the_example_passes_its_assertions(example, tmp_path, monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "Agg")
     runpy.run_path(str(example))
     assert (tmp_path / f"{example.stem}.png").stat().st_size > 4000
-    assert (GALLERY / f"{example.stem}.png").is_file(), "run scripts/make_gallery"
+    assert (GALLERY / f"{example.stem}.png").is_file(), "run scripts/make/gallery"
 
 
 def test_every_example_has_an_assertion():

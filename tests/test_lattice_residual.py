@@ -70,7 +70,7 @@ def test_results_agree_with_precise_solutions_from_any_guess(coarse):
 @pytest.mark.slow
 @pytest.mark.parametrize("mm", [0.7, 1.0, 2.0, 3.0])
 def test_many_presses_agree_with_precise_solutions(mm):
-    """50 presses for each cell size, as in `scripts/measure_press_accuracy`."""
+    """50 presses for each cell size, as in `scripts/measure/press_accuracy`."""
     check(presses(*prepared(mm), *prepared(mm, 1e-6), np.random.default_rng(int(10 * mm)), 50))
 
 
@@ -95,7 +95,7 @@ FRAMES = {
 
 @pytest.mark.parametrize("scene", FRAMES)
 def test_the_reported_residual_of_frames_equals_an_independent_measurement(scene):
-    """Equal to 1e-6 of the load. For all frames: `scripts/check_residuals`."""
+    """Equal to 1e-6 of the load. For all frames: `scripts/measure/residuals`."""
     if not scene.startswith("deep") and not DATA.is_dir():
         pytest.skip("the measured data are missing")
     changes = {"contact.model": "lattice", "contact.resolution_mm": 3.0}

@@ -73,7 +73,7 @@ def loads(insert, contact, size=2.0, bearing="fixed"):
 
 
 def test_random_inserts_keep_their_volume_or_are_refused():
-    """A sample; scripts/measure_random_inserts has 2,000 inserts."""
+    """A sample; scripts/measure/random_inserts has 2,000 inserts."""
     errors, refused = [], []
     for seed in range(15):
         try:

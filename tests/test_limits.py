@@ -6,6 +6,7 @@ import sys
 
 import pytest
 
+from scenes import write_scene
 from tkamb.commands.options import _setting
 from tkamb.contact.registry import contact_model
 from tkamb.errors import InputError
@@ -141,10 +142,9 @@ def test_a_worker_ends_silently_with_its_parent():
 
 
 def test_an_unknown_backend_of_matplotlib_is_ignored(tmp_path):
-    command = [sys.executable, "-m", "tkamb", "check", "--out", str(tmp_path / "a.png")]
-    from scenes import MODEL
-
+    drop = ("contact", "implant", "patella", "patellar_ligament", "quadriceps", "ligament")
+    scene = write_scene(tmp_path / "scene", drop)
+    command = [sys.executable, "-m", "tkamb", "check", "--out", str(tmp_path / "a.png"), str(scene)]
     environment = os.environ | {"MPLBACKEND": "no-such-backend"}
-    command.append(str(MODEL / "scene.toml"))
     process = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert process.returncode == 0, process.stderr

@@ -13,6 +13,8 @@ from tkamb.io.claim import BESIDE, WRITTEN, claimed_directory, occupants
 from tkamb.run.results_folder import write_results
 from tkamb.studies.kept_rows import KeptRows
 
+pytestmark = pytest.mark.usefixtures("plain_report")
+
 SCENE = str(fast_scene())
 COMMANDS = {
     "run": ["run", SCENE, "--frames", "50:51"],

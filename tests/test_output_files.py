@@ -7,6 +7,7 @@ import pytest
 import trimesh
 
 from pendulum_leg import changed, recorded_leg
+from scenes import write_scene
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.io.claim import check_output_file
@@ -122,7 +123,8 @@ def meshes(tmp_path) -> tuple[str, str]:
 
 
 def commands(meshes: tuple[str, str]) -> dict[str, list[str]]:
-    scene = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
+    drop = ("contact", "implant", "patella", "patellar_ligament", "quadriceps", "ligament")
+    scene = write_scene(Path(meshes[0]).parent / "scene", drop)
     return {
         "map.vtp": ["press", *meshes, "--load=100", "--contact=foundation", "--resolution=2"],
         "grid.vtu": ["mesh", "lattice", meshes[1], "--resolution=4"],

@@ -154,12 +154,12 @@ def test_small_strain_agrees_with_finite_strain_of_calculix(varus):
 
 
 def test_the_page_agrees_with_its_script_and_data(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "scripts"))
-    script = runpy.run_path(str(ROOT / "scripts" / "peer_calculix.py"))
+    monkeypatch.syspath_prepend(str(ROOT / "scripts" / "measure"))
+    script = runpy.run_path(str(ROOT / "scripts" / "measure" / "peer_calculix.py"))
     rows = json.loads(
         (ROOT / "scripts" / "data" / "peer_calculix.json").read_text(encoding="utf-8")
     )
     text = (ROOT / "docs" / "development" / "peer_calculix.md").read_text(encoding="utf-8")
     assert script["with_block"](text, script["block"](rows), "peer") == text, (
-        "run scripts/peer_calculix.py --page"
+        "run scripts/measure/peer_calculix.py --page"
     )

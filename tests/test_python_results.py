@@ -15,6 +15,8 @@ from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.io.recordings.meshes import read_triangles
 
+pytestmark = pytest.mark.usefixtures("plain_report")
+
 RUN = make_run("gait", frames=11)
 
 

@@ -40,8 +40,8 @@ def test_the_citation_is_complete_and_of_this_version():
 
 
 def test_the_bill_of_materials_names_every_dependency_with_its_version():
-    path = str(ROOT / "scripts" / "make_sbom")
-    loader = SourceFileLoader("make_sbom", path)
+    path = str(ROOT / "scripts" / "make" / "sbom")
+    loader = SourceFileLoader("sbom", path)
     module = importlib.util.module_from_spec(importlib.util.spec_from_loader(loader.name, loader))
     loader.exec_module(module)
     document = module.document()

@@ -202,7 +202,7 @@ def test_flushed_maps_are_readable_after_a_kill(tmp_path, frames):
 
 def test_the_documentation_lists_every_column():
     page = ROOT / "docs" / "results.md"
-    advice = "run scripts/make_results_page"
+    advice = "run scripts/make/results_page"
     assert columns_as_markdown() in page.read_text(encoding="utf-8"), advice
 
 

@@ -22,6 +22,8 @@ from tkamb.run.results import Results
 from tkamb.run.results_folder import read_results
 from tkamb.run.simulation import simulate
 
+pytestmark = pytest.mark.usefixtures("plain_report")
+
 ROOT = Path(__file__).parents[1]
 CLOCKS = ("body_seconds", "query_seconds", "contact_seconds")
 FRAMES = ("--frames", "0:40:2")

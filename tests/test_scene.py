@@ -28,9 +28,9 @@ ROOT = Path(__file__).parents[1]
 
 
 def test_the_page_is_what_the_schema_says():
-    page = runpy.run_path(str(ROOT / "scripts" / "make_scene_page"))["page"]()
+    page = runpy.run_path(str(ROOT / "scripts" / "make" / "scene_page"))["page"]()
     assert (ROOT / "docs" / "scene.md").read_text(encoding="utf-8") == page, (
-        "run scripts/make_scene_page"
+        "run scripts/make/scene_page"
     )
 
 
@@ -214,5 +214,5 @@ def test_a_key_is_declared_in_one_place(tmp_path, monkeypatch):
     monkeypatch.setattr("tkamb.io.recordings.tibia.load_tibia", reader)
     load_case(load_scene(write_scene(tmp_path), {"tibia.tilt_deg": 3.0, "motion.frames": 3}))
     assert [table.tilt_deg for table in received] == [3.0]
-    page = runpy.run_path(str(ROOT / "scripts" / "make_scene_page"))["page"]()
+    page = runpy.run_path(str(ROOT / "scripts" / "make" / "scene_page"))["page"]()
     assert "| `tilt_deg` | number | `0.0` | tilt of the floor |" in page

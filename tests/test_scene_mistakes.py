@@ -22,7 +22,9 @@ SCENE = MODEL / "scene.toml"
 @pytest.fixture(scope="module")
 def script():
     """Return the script as a module."""
-    loader = importlib.machinery.SourceFileLoader("mistakes_in", f"{ROOT}/scripts/scene_mistakes")
+    loader = importlib.machinery.SourceFileLoader(
+        "mistakes_in", f"{ROOT}/scripts/study/scene_mistakes"
+    )
     module = importlib.util.module_from_spec(importlib.util.spec_from_loader("mistakes_in", loader))
     loader.exec_module(module)
     return module

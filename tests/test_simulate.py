@@ -65,7 +65,7 @@ def test_times_of_parts_add_up_to_less_than_the_whole(timed_bend):
     assert parts.sum() < seconds
 
 
-def test_a_part_of_the_motion_has_the_results_of_the_whole(bend, monkeypatch):
+def test_a_part_of_the_motion_has_the_results_of_the_whole(bend, fresh_surfaces, monkeypatch):
     """Patella and slip are computed for these frames alone; slip is counted from frame 0."""
     places, lows = [], []
     monkeypatch.setattr(PatellofemoralContact, "at", recording(places, PatellofemoralContact.at))

@@ -14,6 +14,8 @@ from tkamb.studies.uncertainty.run import estimate_uncertainty
 from tkamb.studies.uncertainty.sampling import crossed_points, noise, noise_of_point, normal_samples
 from tkamb.studies.uncertainty.sensitivity import Screened, screen, screen_lines, sobol_indices
 
+pytestmark = pytest.mark.usefixtures("plain_report")
+
 A, B = 7.0, 0.1
 
 

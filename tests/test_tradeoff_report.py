@@ -143,7 +143,7 @@ def test_the_tables_of_the_pages_agree_with_the_study():
         ("docs/studies.md", body_block(body), "body"),
     ):
         text = (ROOT / page).read_text(encoding="utf-8")
-        assert with_block(text, lines, name) == text, f"{page}: run scripts/make_tradeoff_table"
+        assert with_block(text, lines, name) == text, f"{page}: run scripts/make/tradeoff_table"
 
 
 def error_cases_rows():
@@ -155,7 +155,7 @@ def test_stored_known_errors_and_their_page_agree_with_both_studies():
     assert STORED.read_text(encoding="utf-8") == known_errors_json(rows, cases)
     page = (ROOT / "docs" / "known_errors.md").read_text(encoding="utf-8")
     assert with_block(page, tables(cases), "known-errors") == page, (
-        "run scripts/measure_known_errors"
+        "run scripts/measure/known_errors"
     )
     (variant,) = [e for key, e in known_errors().items() if key[0] == "lattice[tolerance=0.01]"]
     lines = (ROOT / "docs" / "studies.md").read_text(encoding="utf-8").splitlines()

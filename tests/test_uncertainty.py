@@ -29,6 +29,8 @@ from tkamb.studies.uncertainty.run import estimate_uncertainty, write_uncertaint
 from tkamb.studies.uncertainty.sample import Sampler
 from tkamb.studies.uncertainty.sampling import Point, noise, normal_samples
 
+pytestmark = pytest.mark.usefixtures("plain_report")
+
 SCENE = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
 SLOPES = np.array([3.0, -2.0, 1.0, 0.5])
 LINEAR_SD = float(np.linalg.norm(SLOPES))

@@ -16,6 +16,8 @@ from tkamb.run.recorder import Shard, Shards
 from tkamb.run.results_folder import read_results, write_results
 from tkamb.show.comparison import compare_folders
 
+pytestmark = pytest.mark.usefixtures("plain_report")
+
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):

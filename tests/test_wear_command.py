@@ -25,6 +25,8 @@ from tkamb.studies.wear.simulation import first_cycle
 from tkamb.studies.wear.simulator import read_profile
 from wear_bodies import balls_scene, swing, swinging_case
 
+pytestmark = pytest.mark.usefixtures("plain_report")
+
 CYCLE = """cycle_percent,axial_force_N,flexion_deg,ap_mm,axial_rotation_deg
 0,300,0,0,0
 15,1800,15,-1,1

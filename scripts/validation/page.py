@@ -47,7 +47,7 @@ ORDERED = """\
 "FB / MB" is the mean of Sigma FB (fixed bearing) over that of Sigma MB (mobile bearing). "Trends"
 counts the designs whose change from 0 to 100 % of the bend has the sign of the table."""
 BENT = """\
-Designs from `scripts/make_designs` in a few frames of the shipped knee bend, `lattice` at 2 mm."""
+Designs from `scripts/make/designs` in a few frames of the shipped knee bend, `lattice` at 2 mm."""
 CELLS = """\
 tkamb: nominal result (range over the assumed inputs). Table: mean ± standard deviation. Areas are
 in mm², pressures in MPa. "Contact" is the area where the surfaces touch, "overlap" the area by the

@@ -11,13 +11,14 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
 
 from tkamb.errors import InputError
 from tkamb.files import MEGABYTE, read_text
-
-if TYPE_CHECKING:
-    from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array
+from tkamb.units import MILLIMETRE
 
 
 @dataclass(frozen=True)
@@ -97,28 +98,44 @@ def check_limits(text: str, where: object) -> None:
             raise InputError(f"nests values more than {LIMITS.depth} deep", where)
 
 
-def toml_text(value: str) -> str:
-    """Return a text as TOML, in quotes."""
-    return json.dumps(value, ensure_ascii=False)
+def toml_value(value: Any, decimals: int | None = None) -> str:
+    """Return a text, path, number, list, array or inline table as TOML.
+
+    Args:
+        value: the value.
+        decimals: number of decimals of floating-point numbers; None: all that they need.
+    """
+    if isinstance(value, str | Path):
+        return json.dumps(str(value), ensure_ascii=False)
+    if isinstance(value, Mapping):
+        pairs = (f"{key} = {toml_value(one, decimals)}" for key, one in value.items())
+        return f"{{ {', '.join(pairs)} }}"
+    if isinstance(value, list | tuple | np.ndarray):
+        return f"[{', '.join(toml_value(one, decimals) for one in value)}]"
+    if isinstance(value, bool | np.bool_ | int | np.integer):
+        return str(value).lower()
+    # the sum has no negative zero
+    return (
+        repr(float(value)) if decimals is None else f"{round(value, decimals) + 0.0:.{decimals}f}"
+    )
 
 
-def toml_numbers(values: "Array") -> str:
-    """Return numbers as TOML, with three decimals."""
-    return "[" + ", ".join(f"{round(float(v), 3) + 0.0:.3f}" for v in values) + "]"
+def table_lines(name: str, values: Mapping[str, Any]) -> list[str]:
+    """Return the lines of one table of a scene, with an empty line at its end."""
+    return [name, *(f"{key} = {toml_value(value)}" for key, value in values.items()), ""]
 
 
-def toml_mm(point: "Array") -> str:
+def toml_mm(point: Array) -> str:
     """Return a point (3,) m as TOML, in mm with three decimals."""
-    return toml_numbers(point * 1e3)
+    return toml_value(point / MILLIMETRE, 3)
 
 
 def toml_key(label: str, whole: bool = False) -> str:
     """Return a marker's label as a TOML key. The key has the label's prefix if `whole`."""
     plain = label if whole else label.rpartition(":")[2]
-    return plain if re.fullmatch(r"[A-Za-z0-9_-]+", plain) else toml_text(plain)
+    return plain if re.fullmatch(r"[A-Za-z0-9_-]+", plain) else toml_value(plain)
 
 
-def toml_markers(points: Mapping[str, "Array"], whole: bool = False) -> str:
+def toml_markers(points: Mapping[str, Array], whole: bool = False) -> str:
     """Return an inline table of marker positions, mm. Keys have the labels' prefixes if `whole`."""
-    places = [f"{toml_key(label, whole)} = {toml_mm(point)}" for label, point in points.items()]
-    return f"{{ {', '.join(places)} }}"
+    return toml_value({toml_key(k, whole): p / MILLIMETRE for k, p in points.items()}, 3)

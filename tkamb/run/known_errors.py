@@ -2,10 +2,10 @@
 
 An error is relative to a converged reference. The stored value is the largest error over the
 measured cases. It is no bound for other cases. The cases are those of the trade-off study and
-half of the pairs of bodies of `scripts/error_cases.py`. The other half is held out. It tests the
-share of new errors below the stored ones (docs/known_errors.md). `scripts/make_tradeoff_table`
-writes `run/known_errors.json`. Errors of other settings are not interpolated but reported as "not
-measured".
+half of the pairs of bodies of `scripts/measure/error_cases.py`. The other half is held out. It
+tests the share of new errors below the stored ones (docs/known_errors.md).
+`scripts/make/tradeoff_table` writes `run/known_errors.json`. Errors of other settings are not
+interpolated but reported as "not measured".
 """
 
 import json

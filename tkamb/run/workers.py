@@ -18,7 +18,8 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import IO, Any
@@ -45,25 +46,6 @@ class ClusterSettings:
 CLUSTER = ClusterSettings()
 
 FINISHED_KEPT = "what is finished is kept: go on with resume=True"
-
-
-def answers_of_cluster(
-    task: "Task", tasks: Sequence["Numbered"], address: str
-) -> Iterator["Numbered"]:
-    """Yield the numbers and answers of jobs in the order in which they finish.
-
-    Args:
-        task: task of the workers.
-        tasks: numbers and contents of the jobs.
-        address: address of the scheduler, such as "tcp://host:8786".
-
-    Raises:
-        InputError: Dask is not installed, or no scheduler answers.
-        ComputationError: the scheduler has ended, or a job killed too many workers.
-    """
-    distributed = _library()
-    with _connected(distributed, address) as client:
-        yield from _answers(distributed, client, task, tasks)
 
 
 def check_cluster(address: str) -> None:
@@ -95,18 +77,21 @@ def _connected(distributed: Any, address: str) -> Any:
         ) from None
 
 
-def _answers(
-    distributed: Any, client: Any, task: "Task", tasks: Sequence["Numbered"]
+def _cluster_answers(
+    task: "Task", tasks: Sequence["Numbered"], address: str
 ) -> Iterator["Numbered"]:
+    distributed = _library()
     packed = pickle.dumps((task.make, task.arguments))
     try:
-        futures = {
-            client.submit(answer, packed, number, job, pure=False): number for number, job in tasks
-        }
-        for future in distributed.as_completed(futures):
-            if future.cancelled():
-                raise ComputationError("the Dask scheduler has ended", "--dask", FINISHED_KEPT)
-            yield futures.pop(future), future.result()
+        with _connected(distributed, address) as client:
+            futures = {
+                client.submit(answer, packed, number, job, pure=False): number
+                for number, job in tasks
+            }
+            for future in distributed.as_completed(futures):
+                if future.cancelled():
+                    raise ComputationError("the Dask scheduler has ended", "--dask", FINISHED_KEPT)
+                yield futures.pop(future), future.result()
     except distributed.KilledWorker:
         what = f"a job killed {CLUSTER.most_deaths} workers"
         raise ComputationError(
@@ -235,35 +220,49 @@ class PoolOptions:
             team.stop()
 
 
-def _answers_here(task: Task, tasks: Sequence[Numbered]) -> Iterator[Numbered]:
-    work = task.prepared() if tasks else None
-    for number, job in tasks if work else ():
-        assert work is not None
-        yield number, work(number, job)
-
-
 class WorkerPool:
     """Worker processes that compute the jobs of one task.
 
     Args:
-        crew: options of the pool.
+        options: options of the pool.
         task: task of the workers.
-        count: number of worker processes; 0: the jobs are computed on the cluster of `crew`, or in
-            this process.
+        count: number of worker processes; 0: the jobs are computed on the cluster of `options`, or
+            in this process.
 
     Attributes:
         processes: the worker processes.
     """
 
-    def __init__(self, crew: PoolOptions, task: Task, count: int) -> None:
-        self._crew, self._task = crew, task
-        self._jobs: queue.SimpleQueue[Numbered | None] = queue.SimpleQueue()
-        self._answers: queue.SimpleQueue[Numbered | TkambError] = queue.SimpleQueue()
+    def __init__(self, options: PoolOptions, task: Task, count: int) -> None:
+        self._options, self._task = options, task
+        self._free: queue.SimpleQueue[subprocess.Popen[bytes]] = queue.SimpleQueue()
+        self._threads = ThreadPoolExecutor(max(count, 1))
         self.processes = [_start() for _ in range(count)]
-        for process in self.processes:
-            threading.Thread(
-                target=_attend, args=(process, task, self._jobs, self._answers), daemon=True
-            ).start()
+        for process in self.processes:  # a thread sends the task, since a pipe holds only 64 kB
+            self._threads.submit(self._prepare, process)
+
+    def _prepare(self, process: "subprocess.Popen[bytes]") -> None:
+        assert process.stdin is not None
+        with suppress(OSError):  # the worker has ended, as its first job will report
+            # not the Task itself: the worker has its own class Task, in the module __main__
+            _send(process.stdin, (self._task.make, self._task.arguments))
+        self._free.put(process)
+
+    def _answer(self, job: Numbered) -> Numbered:
+        """Return number and answer of a job from the next free worker."""
+        process = self._free.get()
+        assert process.stdin is not None and process.stdout is not None
+        try:
+            _send(process.stdin, job)
+            answer: Numbered | TkambError = pickle.load(process.stdout)
+        except (OSError, EOFError, ValueError, pickle.UnpicklingError):
+            hint = f"check that there is enough memory; {FINISHED_KEPT}"
+            raise ComputationError(ENDED, "workers", hint) from None
+        finally:
+            self._free.put(process)
+        if isinstance(answer, TkambError):
+            raise answer
+        return answer
 
     def answers(self, tasks: Sequence[Numbered]) -> Iterator[Numbered]:
         """Yield the numbers and answers of jobs in the order in which they finish.
@@ -275,26 +274,23 @@ class WorkerPool:
             InputError: the preparation of a worker fails.
             ComputationError: a worker was killed, or the scheduler has ended.
         """
-        if self._crew.dask is not None and tasks:
-            yield from answers_of_cluster(self._task, tasks, self._crew.dask)
+        if not tasks:
             return
-        if not self.processes:
-            yield from _answers_here(self._task, tasks)
-            return
-        for job in tasks:
-            self._jobs.put(job)
-        for _ in tasks:
-            answer = self._answers.get()
-            if isinstance(answer, TkambError):
-                raise answer
-            yield answer
+        if self._options.dask is not None:
+            yield from _cluster_answers(self._task, tasks, self._options.dask)
+        elif not self.processes:
+            work = self._task.prepared()
+            yield from ((number, work(number, job)) for number, job in tasks)
+        else:
+            for future in as_completed([self._threads.submit(self._answer, job) for job in tasks]):
+                yield future.result()
 
     def stop(self) -> None:
         """Kill the worker processes."""
         for process in self.processes:
-            self._jobs.put(None)
             process.kill()
             process.wait()
+        self._threads.shutdown(cancel_futures=True)
 
 
 def _start() -> "subprocess.Popen[bytes]":
@@ -306,25 +302,6 @@ def _start() -> "subprocess.Popen[bytes]":
         stdout=subprocess.PIPE,
         start_new_session=True,
     )
-
-
-def _attend(
-    process: "subprocess.Popen[bytes]",
-    task: Task,
-    jobs: "queue.SimpleQueue[Numbered | None]",
-    answers: "queue.SimpleQueue[Numbered | TkambError]",
-) -> None:
-    """Send jobs to a worker, and collect its answers, until the job is None or the worker ends."""
-    assert process.stdin is not None and process.stdout is not None
-    try:
-        # not the Task itself: the worker has its own class Task, in the module __main__
-        _send(process.stdin, (task.make, task.arguments))
-        while (job := jobs.get()) is not None:
-            _send(process.stdin, job)
-            answers.put(pickle.load(process.stdout))
-    except (OSError, EOFError, ValueError, pickle.UnpicklingError):
-        hint = f"check that there is enough memory; {FINISHED_KEPT}"
-        answers.put(ComputationError(ENDED, "workers", hint))
 
 
 def _send(stream: IO[bytes], value: object) -> None:
@@ -354,20 +331,22 @@ def _answer(work: Callable[[int, Any], Any], number: int, job: Any) -> Numbered 
     """Return number and answer of a job, or the error, which the parent raises."""
     try:
         return number, work(number, job)
-    except TkambError as error:
-        return error
     except Exception as error:
-        return ComputationError(unforeseen_words(error, argparse.Namespace()))
+        return _known(error)
+
+
+def _known(error: Exception) -> TkambError:
+    if isinstance(error, TkambError):
+        return error
+    return ComputationError(unforeseen_words(error, argparse.Namespace()))
 
 
 def _prepared(task: Task) -> Callable[[int, Any], Any]:
     """Return the function of the jobs. If the preparation fails, each job raises its error."""
     try:
         return task.prepared()
-    except TkambError as error:
-        wrong: TkambError = error
     except Exception as error:
-        wrong = ComputationError(unforeseen_words(error, argparse.Namespace()))
+        wrong = _known(error)
 
     def refuse(number: int, job: object) -> None:
         raise wrong

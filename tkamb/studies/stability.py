@@ -23,7 +23,7 @@ from tkamb.studies.verdict import KINDS, Verdict, judge, judge_closed_form
 Case = Extreme | ClosedForm | SceneExtreme
 
 STORED = Path(__file__).with_name("verdicts.json")
-"""Accepted verdict on each case. `scripts/make_stability_verdicts` writes the file."""
+"""Accepted verdict on each case. `scripts/make/stability_verdicts` writes the file."""
 
 
 @dataclass(frozen=True)

@@ -143,7 +143,7 @@ def peer_distances(extreme: Extreme, result: ContactResult) -> dict[str, float]:
         raise InputError(
             "CalculiX's result belongs to an earlier version of the case",
             f"case '{extreme.label}'",
-            "run scripts/make_stability_answers",
+            "run scripts/make/stability_answers",
         )
     differences = errors(quantities(result), peer)
     return {name: differences[name] for name in PEER_BOUNDS}

@@ -21,7 +21,7 @@ from tkamb.io.importing.markers import ModelSegment
 from tkamb.io.recordings.meshes import axes_rotation
 from tkamb.io.recordings.motion import KneeMotion, load_motion
 from tkamb.io.recordings.recording_tables import MotionTable
-from tkamb.io.toml_text import toml_markers, toml_mm, toml_text
+from tkamb.io.toml_text import toml_markers, toml_mm, toml_value
 from tkamb.units import DEGREE, MILLIMETRE
 
 
@@ -132,7 +132,7 @@ def _centre_lines(
     """
     return [
         "[[tibia.joint_centre]]",
-        f"name = {toml_text(name)}",
+        f"name = {toml_value(name)}",
         f"markers_mm = {toml_markers(markers)}",
         f"centre_mm = {toml_mm(centre)}",
         f"tibia_mm = {toml_mm(tibia)}",
@@ -211,12 +211,12 @@ class RecordedPoses:
         for key, value in self.given.keys().items():
             if key == "cycle_s":
                 lines.append("# s, assumed times of the recording at 0 and 100 %")
-            lines.append(f"{key} = {_toml(value)}")
+            lines.append(f"{key} = {toml_value(value)}")
         if self.interval:
-            lines.append(f"interval_s = {_toml(list(self.interval))}")
+            lines.append(f"interval_s = {toml_value(self.interval)}")
         lines += ["", "# the femoral mesh in the insert mesh's own axes", "[motion.columns]"]
         named = zip(ROLES, self.given.columns, strict=True)
-        return lines + [f"{role} = {toml_text(column)}" for role, column in named]
+        return lines + [f"{role} = {toml_value(column)}" for role, column in named]
 
 
 def read_poses(
@@ -302,9 +302,3 @@ def _remarks(recording: PoseRecording, motion: KneeMotion) -> tuple[str, ...]:
             f"{recording.stride[1]:g} s of the recording, as given ({closed})"
         )
     return tuple(text)
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, list):
-        return f"[{', '.join(_toml(v) for v in value)}]"
-    return toml_text(value) if isinstance(value, str) else f"{value:.9g}"

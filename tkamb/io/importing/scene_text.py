@@ -1,6 +1,5 @@
 """Text of the scene file that an import writes, with all inferred values."""
 
-import json
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +12,7 @@ from tkamb.io.importing.model_motion import MOTION_FILE, motion_tables
 from tkamb.io.importing.recorded_poses import RecordedPoses, ShankMarkers
 from tkamb.io.importing.soft_tissue import End, SoftTissue
 from tkamb.io.recordings.unit_words import GivenUnits
-from tkamb.io.toml_text import toml_markers, toml_mm, toml_numbers, toml_text
+from tkamb.io.toml_text import toml_markers, toml_mm, toml_value
 from tkamb.units import DEGREE
 
 GROUND_FILE = "ground_reaction.csv"
@@ -164,12 +163,12 @@ class SceneText:
         return "\n\n".join("\n".join(lines) for lines in tables if lines) + "\n"
 
     def _path(self, path: Path) -> str:
-        return toml_text(Path(os.path.relpath(path.absolute(), self.folder.absolute())).as_posix())
+        return toml_value(Path(os.path.relpath(path.absolute(), self.folder.absolute())).as_posix())
 
     def _patient(self) -> list[str]:
         return [
             "[patient]",
-            f"urdf = {toml_text(self.urdf)}",
+            f"urdf = {toml_value(self.urdf)}",
             f'side = "{self.side}"',
             f"mass_kg = {self.mass_kg:g}",
         ]
@@ -201,10 +200,10 @@ class SceneText:
             "[motion.markers]",
             f'method = "{m.method}"  # "segments": shank and thigh separately; or "chain"',
             f'knee = "{m.knee}"',
-            f"coordinates = {json.dumps(coordinates)}",
+            f"coordinates = {toml_value(coordinates)}",
             "# position and rotation of the straight knee in the model",
             f"neutral_mm = {toml_mm(neutral[:3])}",
-            f"neutral_deg = {toml_numbers(neutral[3:5] / DEGREE)}",
+            f"neutral_deg = {toml_value(neutral[3:5] / DEGREE, 3)}",
             f'laboratory_axes = "{m.axes}"',
         ]
         return lines
@@ -217,13 +216,13 @@ class SceneText:
         g = self.ground
         if g is None:
             return []
-        file = toml_text(GROUND_FILE) if g.made else self._path(g.path)
+        file = toml_value(GROUND_FILE) if g.made else self._path(g.path)
         lines = ["[ground_reaction]", f"file = {file}"]
         lines += [f"plates = {list(g.plates)}"] if g.plates else []
         length = g.length_unit or g.units.length
         lines += [f'length_unit = "{length}"'] if length else []
         for key, unit in (("force_unit", g.units.force), ("moment_unit", g.units.moment)):
-            lines += [f"{key} = {toml_text(unit)}"] if unit else []
+            lines += [f"{key} = {toml_value(unit)}"] if unit else []
         lines += [
             f'laboratory_axes = "{g.axes}"',
             f"cutoff_Hz = {self.cutoff_Hz:g}",
@@ -234,7 +233,7 @@ class SceneText:
             lines.append(f"surface_mm = {round(g.surface * 1e3, -1):.0f}")
         if g.columns:
             lines += ["", "[ground_reaction.columns]"]
-            lines += [f"{role} = {toml_text(column)}" for role, column in g.columns]
+            lines += [f"{role} = {toml_value(column)}" for role, column in g.columns]
         return lines
 
     def _implant(self) -> list[list[str]]:
@@ -290,7 +289,7 @@ class SceneText:
         m = self.meshes
         if m is None or m.femur_bone is None:
             return []
-        link = toml_text(body_link(self.links.leg.femur[0]))
+        link = toml_value(body_link(self.links.leg.femur[0]))
         mesh = f'mesh = {self._path(m.femur_bone)}, unit = "{m.unit}"'
         return [
             "# bone that the line may wrap, as well as the component",
@@ -309,7 +308,7 @@ class SceneText:
                 lines += [
                     "",
                     "[[ligament]]",
-                    f"name = {toml_text(b.name)}",
+                    f"name = {toml_value(b.name)}",
                     'law = "quadratic-toe"',
                 ]
                 lines += [_end("proximal", b.proximal), _end("distal", b.distal)]
@@ -355,8 +354,8 @@ class SceneText:
             lines.append("# 0 and 100 %: two foot strikes on the force plates")
         elif self.cycle is not None:
             lines.append(f"cycle_s = [{self.cycle[0]:g}, {self.cycle[1]:g}]")
-        lines += [f"activity = {toml_text(self.activity)}"] if self.activity else []
-        return [*lines, "notes = [", *(f"    {toml_text(note)}," for note in self.notes), "]"]
+        lines += [f"activity = {toml_value(self.activity)}"] if self.activity else []
+        return [*lines, "notes = [", *(f"    {toml_value(note)}," for note in self.notes), "]"]
 
 
 _ALL = ["flexion", "adduction", "axial_rotation", "ap", "si", "ml"]
@@ -364,7 +363,7 @@ _ALL = ["flexion", "adduction", "axial_rotation", "ap", "si", "ml"]
 
 def _end(key: str, end: End) -> str:
     """Return the line for one end of a muscle or ligament."""
-    return f"{key} = {{ link = {toml_text(end.link)}, point_mm = {toml_mm(end.point)} }}"
+    return f"{key} = {{ link = {toml_value(end.link)}, point_mm = {toml_mm(end.point)} }}"
 
 
 def _segment(segment: ModelSegment, whole_labels: bool) -> list[str]:
@@ -384,4 +383,7 @@ def _button(in_patella: Array | None) -> list[str]:
     if in_patella is None:
         return []
     angles = Rotation.from_matrix(in_patella[:3, :3]).as_euler("XYZ") / DEGREE
-    return [f"position_mm = {toml_mm(in_patella[:3, 3])}", f"rotation_deg = {toml_numbers(angles)}"]
+    return [
+        f"position_mm = {toml_mm(in_patella[:3, 3])}",
+        f"rotation_deg = {toml_value(angles, 3)}",
+    ]

@@ -1,7 +1,6 @@
 """Write a state of the bench as a scene, from which `tkamb run` computes the same numbers."""
 
 import csv
-import json
 import logging
 import re
 import shutil
@@ -25,6 +24,7 @@ from tkamb.io.recordings.scene_table import SceneTable
 from tkamb.io.scene.case import Case
 from tkamb.io.scene.tables import STIFFNESS_KEYS
 from tkamb.io.starter.person import Person, patient_urdf
+from tkamb.io.toml_text import table_lines
 from tkamb.knee.knee import Knee
 from tkamb.knee.ligament_laws import law_name
 from tkamb.knee.load import LinkPoint
@@ -96,23 +96,6 @@ def _write_table(path: Path, header: list[str], rows: list[list[float]]) -> None
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(header)
         writer.writerows([[repr(float(value)) for value in row] for row in rows])
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str | Path):
-        return json.dumps(str(value), ensure_ascii=False)
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(_toml(one) for one in value)}]"
-    if isinstance(value, Mapping):
-        return f"{{ {', '.join(f'{key} = {_toml(one)}' for key, one in value.items())} }}"
-    return repr(value)
-
-
-def table_lines(name: str, values: Mapping[str, Any]) -> list[str]:
-    """Return the lines of one table of a scene file."""
-    return [name, *(f"{key} = {_toml(value)}" for key, value in values.items()), ""]
 
 
 STILL = {
