@@ -10,7 +10,8 @@ By the implicit function theorem, with J0 and J1 of `pin.dIntegrate`,
 
     (I - h a_v - h² a_q J1) dv' = dv + h a_q J0 dq + h a_u du.
 
-`CondyleForces` is a residual for a cost on the contact forces. If the contact model is out of its
+`CondyleForces` is a residual for a cost on the contact forces. Crocoddyl must fit the installed
+Pinocchio (`tkamb.crocoddyl_pair`). If the contact model is out of its
 range, or Newton's method does not converge, the next state is NaN: the solver then shortens its
 step.
 
@@ -24,6 +25,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from tkamb.crocoddyl_pair import checked
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array
 from tkamb.knee.knee import Knee
@@ -36,6 +38,7 @@ except ImportError as error:
         "tkamb.crocoddyl",
         'install it: pip install "tkamb[control]"',
     ) from error
+checked(crocoddyl.__version__, pin.__version__)
 
 
 class KneeDynamics(crocoddyl.DifferentialActionModelAbstract):

@@ -171,6 +171,7 @@ class Knee(AssembledKnee):
         twists = self.relative_jacobian(q, data)
         twists = mirrored_spatial(twists.T).T if self.left else twists
         probed = self.contact_at(data, self.at(q, data))
+        probed = contact.with_exact_tangent(data.probe, probed)
         if not (probed.tangent and probed.exact):
             raise InputError(f"{contact.model.name} has no exact tangent", "condyle_forces")
         forces, slopes = np.zeros(2), np.zeros((2, self.model.nv))
@@ -247,7 +248,8 @@ class Knee(AssembledKnee):
             joint's force in its joint's frame, N and N·m per m, rad, m/s or rad/s.
 
         Raises:
-            InputError: see `external_forces`.
+            InputError: see `external_forces`; or the forces of the contact model jump from facet to
+                facet (`hertz`).
             ComputationError: see `external_forces`.
         """
         from tkamb.knee.derivatives import force_derivatives
@@ -455,7 +457,8 @@ class Knee(AssembledKnee):
         contact = self._need_contact()
         if result.status.value == "out_of_range":
             raise ComputationError("; ".join(result.flags), "press")
-        probed = contact.probe(start).seen(result, start)
+        probe = contact.probe(start)
+        probed = contact.with_exact_tangent(probe, probe.seen(result, start))
         exact_tangent(probed, contact.model.name)
         slopes = press_derivatives(contact.pair, result.pose, probed)
         return replace(slopes, by_pose=mirrored_spatial(slopes.by_pose)) if self.left else slopes
@@ -562,7 +565,10 @@ class Knee(AssembledKnee):
     ) -> "EquilibriumDerivatives":
         from tkamb.knee.solution_derivatives import ImplicitEquilibrium, exact_tangent
 
-        exact_tangent(knee.contact, self._need_contact().model.name)
+        model = self._need_contact()
+        contact = model.exact_at(knee_pose(knee.coordinates), knee.contact)
+        exact_tangent(contact, model.model.name)
+        knee = replace(knee, contact=contact)
         slopes = ImplicitEquilibrium(search, instant, knee, points).derivatives()
         if self.left:
             # Coordinates are those of the mirror image; the load is in the user's frame.

@@ -58,7 +58,7 @@ def exact_tangent(contact: "ProbedContact", name: str) -> None:
         raise InputError(
             f"contact model '{name}' has no exact tangent",
             "derivatives",
-            "take the foundation, or a lattice with a linear material",
+            "take the foundation or a lattice",
         )
 
 

@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from tkamb.contact.lattice.initial_guess import lattice_start
+from tkamb.contact.lattice.initial_guess import LatticeStart, lattice_start
 from tkamb.contact.lattice.problem import ContactProblem, LatticeState
 from tkamb.contact.model import Probe, ProbedContact, condyle_wrenches
 from tkamb.contact.pressing import Presses
@@ -62,6 +62,8 @@ class LatticeProbe(Probe):
         self._lattice_model, self._accuracy = model, accuracy
         self._measured: tuple[Array, float] | None = None
         """Last pose at which the whole solid was evaluated, and norm of the forces there, N."""
+        self._last: tuple[ContactResult, LatticeStart, Index] | None = None
+        """Last contact with loaded nodes: its result, its warm start and these nodes."""
 
     def evaluated(self, pose: Array) -> tuple[ContactResult, WarmStart]:
         """Return the contact at a pose, and a warm start.
@@ -82,16 +84,40 @@ class LatticeProbe(Probe):
 
     def seen(self, result: ContactResult, start: WarmStart | None = None) -> ProbedContact:
         """Return the condyles' forces of a result, with their stiffness."""
-        condyles = condyle_wrenches(result, self._state.pair.split)
-        exact = self._state.problem.solid.material.is_linear
         nodes = np.flatnonzero(result.nodal_force.any(axis=1))
-        solution = lattice_start(self._state, start)
-        if not len(nodes):
-            return ProbedContact(condyles, tangent=True, exact=exact, accuracy=self._accuracy)
-        if solution is None:
+        solution, self._last = lattice_start(self._state, start), None
+        if len(nodes) and solution is None:
+            condyles = condyle_wrenches(result, self._state.pair.split)
             return ProbedContact(condyles, accuracy=self._accuracy)
-        change = force_changes(self._state, result, solution.displacement, nodes)
-        points = result.points[nodes]
+        change = np.zeros((0, 3, 6))
+        if solution is not None and len(nodes):
+            self._last = result, solution, nodes
+            change = force_changes(self._state, result, solution.displacement, nodes)
+        # The search of equilibrium takes the tangent of a linear material as exact.
+        exact = not len(nodes) or self._state.problem.solid.material.is_linear
+        return self._with_changes(result, nodes, change, exact, with_centre=False)
+
+    def exact_tangent(self, contact: ProbedContact) -> ProbedContact:
+        """Return the last contact with its exact tangent; see `tkamb.contact.lattice.exact_tangent`.
+
+        Args:
+            contact: the last result of `at` or `seen`.
+        """
+        if self._last is None:
+            return contact
+        from tkamb.contact.lattice.exact_tangent import exact_force_changes
+
+        result, start, nodes = self._last
+        change = exact_force_changes(self._state, result, start, nodes)
+        return self._with_changes(result, nodes, change, exact=True, with_centre=True)
+
+    def _with_changes(
+        self, result: ContactResult, nodes: Index, change: Array, exact: bool, with_centre: bool
+    ) -> ProbedContact:
+        """Return the condyles of a result with the changes (m, 3, 6) of the forces on its nodes."""
+        condyles = condyle_wrenches(result, self._state.pair.split)
+        points, force = result.points[nodes], result.nodal_force[nodes]
+        size = np.linalg.norm(force, axis=1)
         medial = medial_points(points, result.pose, self._state.pair.split)
         for side, on_side in (("medial", medial), ("lateral", ~medial)):
             if side in condyles:
@@ -99,6 +125,12 @@ class LatticeProbe(Probe):
                 moment = np.cross(points[on_side, :, None], part, axis=1)
                 stiffness = np.vstack([part.sum(axis=0), moment.sum(axis=0)])
                 condyles[side] = replace(condyles[side], stiffness=stiffness)
+                if with_centre:  # the centre is sum(x |f|) / sum(|f|) over the nodes
+                    away = points[on_side] - condyles[side].centre
+                    growth = np.einsum("ia,iak->ik", force[on_side], part)
+                    growth /= size[on_side, None]
+                    slope = away.T @ growth / size[on_side].sum()
+                    condyles[side] = replace(condyles[side], centre_slope=slope)
         return ProbedContact(condyles, tangent=True, exact=exact, accuracy=self._accuracy)
 
 
