@@ -15,6 +15,7 @@ from knee_bodies import mirrored_se3, whole_body
 from test_knee import at, pressed
 from test_knee_plain_model import state_of, without_patella
 from tkamb.contact.lattice import model as lattice_model
+from tkamb.contact.lattice.linear import compliance
 from tkamb.knee import patella_search
 
 TOLERANCE = 1e-5
@@ -33,7 +34,8 @@ def sharpen(monkeypatch):
         max_evaluations=30,
     )
     monkeypatch.setattr(patella_search, "PATELLA_SEARCH", sharp)
-    monkeypatch.setattr(lattice_model, "SINGLE", np.float64)
+    for module in (lattice_model, compliance):
+        monkeypatch.setattr(module, "SINGLE", np.float64)
 
 
 def vectors(forces):
@@ -233,7 +235,8 @@ def contact_case(read, name, **parts):
 
 def lattice_case(read, name, newton):
     options = {"tolerance": 1e-9, "newton": newton, "cache": False}
-    knee = knee_of(read[0], name, 4e-3, options)
+    resolution = 3e-3 if newton else 2e-3
+    knee = knee_of(read[0], name, resolution, options)
     return Case(knee, lambda count: random_states(read, knee, count))
 
 

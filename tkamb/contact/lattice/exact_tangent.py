@@ -62,9 +62,9 @@ def exact_force_changes(
     turned[:, :, 3:] += np.cross(np.eye(3)[None], normals[:, None, :]).transpose(0, 2, 1)
     turned *= size[:, None, None]  # b
     compliance = _compliance(state, result, start, nodes)
-    following = (compliance.reshape(-1, count, 3) @ (size[:, None, None] * turn)).reshape(
-        3 * count, -1
-    )
+    following = np.einsum(
+        "kja,jab->kjb", compliance.reshape(-1, count, 3), size[:, None, None] * turn
+    ).reshape(3 * count, -1)  # C lambda G
     right = np.hstack([_by_node(compliance, normals), compliance @ turned.reshape(3 * count, 6)])
     solved = np.linalg.solve(np.eye(3 * count) - following, right)
     by_size, by_turning = solved[:, :count].reshape(count, 3, -1), solved[:, count:]
