@@ -131,7 +131,9 @@ def agreement(values, computed, knee, q, v, steps=SHORT):
             ]
             jump = min(np.abs(ahead - behind).max() for ahead, behind in pairs) / size[k]
             best = min(
-                np.abs(computed[0][..., k] - side).max() / size[k] for pair in pairs for side in pair
+                np.abs(computed[0][..., k] - side).max() / size[k]
+                for pair in pairs
+                for side in pair
             )
             if jump > TOLERANCE and best < TOLERANCE:
                 on_kinks.append(float(best))
@@ -354,9 +356,7 @@ def two_knees_case(read):
     for name in names:
         frame = other.frames[other.getFrameId(name)]
         parent = frame.parentJoint + offset
-        model.addFrame(
-            pin.Frame(f"left_{name}", parent, 0, frame.placement, pin.FrameType.BODY)
-        )
+        model.addFrame(pin.Frame(f"left_{name}", parent, 0, frame.placement, pin.FrameType.BODY))
     contact = tkamb.contact_model("foundation", resolution=3e-3)
 
     def renamed(line):

@@ -48,9 +48,9 @@ for step in np.diag(steps):
     ahead, behind = (knee.forward_dynamics(q + s * step, v, tau) for s in (1, -1))
     columns.append((ahead - behind) / (2 * step.sum()))
 differences = np.array(columns).T
-held = pin.computeABADerivatives(
-    model, model.createData(), q, v, tau, knee.external_forces(q, v)
-)[0]
+held = pin.computeABADerivatives(model, model.createData(), q, v, tau, knee.external_forces(q, v))[
+    0
+]
 
 
 def errors(derivative):
@@ -61,7 +61,9 @@ def errors(derivative):
 figure, axes = plt.subplots(figsize=(6, 3.2), layout="constrained")
 place = np.arange(len(names))
 axes.bar(place - 0.2, errors(held), 0.4, label="forces held constant", color="#D55E00")
-axes.bar(place + 0.2, errors(exact), 0.4, label="Knee.forward_dynamics_derivatives", color="#0072B2")
+axes.bar(
+    place + 0.2, errors(exact), 0.4, label="Knee.forward_dynamics_derivatives", color="#0072B2"
+)
 axes.set(yscale="log", ylabel="relative error of da/dq", ylim=(1e-10, 30))
 axes.set_xticks(place, names, rotation=25)
 axes.legend(fontsize=8)

@@ -98,7 +98,7 @@ class LatticeProbe(Probe):
         return self._with_changes(result, nodes, change, exact, with_centre=False)
 
     def exact_tangent(self, contact: ProbedContact) -> ProbedContact:
-        """Return the last contact with its exact tangent; see `tkamb.contact.lattice.exact_tangent`.
+        """Return the last contact with the tangent of `tkamb.contact.lattice.exact_tangent`.
 
         Args:
             contact: the last result of `at` or `seen`.
