@@ -80,6 +80,7 @@ def action(control):
         ("control", crocoddyl.ResidualModelControl(state, 5), 1e-3),
         ("frame", crocoddyl.ResidualModelFrameTranslation(state, frame, target, 5), 10.0),
         ("contact", control.CondyleForces(state, knee, 5), 1e-5),
+        ("pressure", control.CondylePressures(state, knee, 5), 1e-13),
     ):
         costs.addCost(name, crocoddyl.CostModelResidual(state, residual), weight)
     q = np.array([0.1, -6.9e-3, 0.0, 0.5])

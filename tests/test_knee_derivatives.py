@@ -17,6 +17,7 @@ from derivative_cases import (
     sharpen,
     vectors,
 )
+from knee_bodies import whole_body
 from test_knee import FOUNDATION, SCENE, at, pressed
 from tkamb.contact import foundation, pressing
 from tkamb.errors import InputError
@@ -55,6 +56,22 @@ def test_a_contact_that_jumps_has_no_derivative(read):
     q = pressed(knee, motion.q[60], 1000.0)
     with pytest.raises(InputError, match="hertz"):
         knee.external_forces_derivatives(q, motion.v[60])
+
+
+@pytest.mark.parametrize("left", [False, True])
+def test_smooth_peak_pressures(read, left):
+    """They are below the peaks, and their slopes are those along a random direction."""
+    body = whole_body(read[0], left=left)
+    recorded = at(read, 60)
+    q = body.state(pressed(read[0], recorded[0], 1000.0), *recorded[1:])[0]
+    peaks, result = body.knee.condyle_pressures(q), body.knee.evaluate(q)
+    for peak, condyle in zip(peaks, (result.medial, result.lateral), strict=True):
+        assert 0.6 * condyle.peak_pressure < peak < condyle.peak_pressure
+    zero = np.zeros(body.model.nv)
+    slopes = body.knee.condyle_pressure_slopes(q)
+    computed = slopes, 0.0 * slopes
+    values = lambda q, v: body.knee.condyle_pressures(q)  # noqa: E731
+    assert direction_error(values, computed, body.knee, q, zero, (1e-9, 1e-8)) < 1e-4
 
 
 def test_dynamics(read):

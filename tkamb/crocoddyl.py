@@ -10,10 +10,9 @@ By the implicit function theorem, with J0 and J1 of `pin.dIntegrate`,
 
     (I - h a_v - h² a_q J1) dv' = dv + h a_q J0 dq + h a_u du.
 
-`CondyleForces` is a residual for a cost on the contact forces. Crocoddyl must fit the installed
-Pinocchio (`tkamb.crocoddyl_pair`). If the contact model is out of its
-range, or Newton's method does not converge, the next state is NaN: the solver then shortens its
-step.
+`CondyleForces` and `CondylePressures` are residuals for costs on the contact. If the model is
+out of its range, or Newton's method does not converge, the next state is NaN: the solver then
+shortens its step. Crocoddyl must fit the installed Pinocchio (`tkamb.crocoddyl_pair`).
 
 Reference: Mastalli et al., Crocoddyl: an efficient and versatile framework for multi-contact
 optimal control, ICRA (2020), doi:10.1109/ICRA40945.2020.9196673.
@@ -295,11 +294,10 @@ class KneeStepData(crocoddyl.ActionDataAbstract):
         self.velocity: Array | None = None
 
 
-class CondyleForces(crocoddyl.ResidualModelAbstract):
-    """Residual: the contact forces of the medial and the lateral condyle, N, shape (2,).
+class _CondyleResidual(crocoddyl.ResidualModelAbstract):
+    """Residual of one value per condyle, medial and lateral, that depends on q alone.
 
-    The forces depend on q alone. They are NaN if the contact model is out of its range. The contact
-    model needs an exact tangent, as the foundation has.
+    The values are NaN if the contact model is out of its range.
 
     Args:
         state: `crocoddyl.StateMultibody` of `knee.model`.
@@ -313,15 +311,54 @@ class CondyleForces(crocoddyl.ResidualModelAbstract):
         self._data = knee.create_data()
 
     def calc(self, data: Any, x: Array, u: Array | None = None) -> None:
-        """Set the forces."""
-        data.r = self._forces(x)[0]
+        """Set the values."""
+        try:
+            data.r = self._values(x[: self.state.nq])
+        except ComputationError:
+            data.r = np.full(2, np.nan)
 
     def calcDiff(self, data: Any, x: Array, u: Array | None = None) -> None:
-        """Set the derivative of the forces by x."""
-        data.Rx[:, :] = np.hstack([self._forces(x)[1], np.zeros((2, self.state.nv))])
-
-    def _forces(self, x: Array) -> tuple[Array, Array]:
+        """Set the derivative of the values by x."""
         try:
-            return self.knee.condyle_forces(x[: self.state.nq], self._data)
+            by_q = self._slopes(x[: self.state.nq])
         except ComputationError:
-            return np.full(2, np.nan), np.full((2, self.state.nv), np.nan)
+            by_q = np.full((2, self.state.nv), np.nan)
+        data.Rx[:, :] = np.hstack([by_q, np.zeros((2, self.state.nv))])
+
+    def _values(self, q: Array) -> Array:
+        raise NotImplementedError
+
+    def _slopes(self, q: Array) -> Array:
+        raise NotImplementedError
+
+
+class CondyleForces(_CondyleResidual):
+    """Residual: the contact forces of the medial and the lateral condyle, N, shape (2,).
+
+    The contact model needs an exact tangent, as foundation and lattices have. The arguments are
+    those of `CondylePressures`.
+    """
+
+    def _values(self, q: Array) -> Array:
+        return self.knee.condyle_forces(q, self._data)[0]
+
+    def _slopes(self, q: Array) -> Array:
+        return self.knee.condyle_forces(q, self._data)[1]
+
+
+class CondylePressures(_CondyleResidual):
+    """Residual: smooth peak pressures of the medial and the lateral condyle, Pa, shape (2,).
+
+    `tkamb.knee.smooth_peak` has the equation.
+
+    Args:
+        state: `crocoddyl.StateMultibody` of `knee.model`.
+        knee: a knee with a contact model.
+        nu: number of controls.
+    """
+
+    def _values(self, q: Array) -> Array:
+        return self.knee.condyle_pressures(q, self._data)
+
+    def _slopes(self, q: Array) -> Array:
+        return self.knee.condyle_pressure_slopes(q, self._data)

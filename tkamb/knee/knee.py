@@ -181,6 +181,37 @@ class Knee(AssembledKnee):
                 slopes[k] = probed.condyles[side].force_slope @ twists
         return forces, slopes
 
+    def condyle_pressures(self, q: Array, data: KneeData | None = None) -> Array:
+        """Return the smooth peak pressures (2,), Pa, of medial and lateral condyle at q.
+
+        `tkamb.knee.smooth_peak` has the equation.
+
+        Raises:
+            InputError: the knee has no contact model.
+            ComputationError: the contact model is out of its range.
+        """
+        from tkamb.knee.smooth_peak import smooth_peaks
+
+        contact, data = self._need_contact(), self.create_data() if data is None else data
+        return smooth_peaks(contact, self.at(q, data).pose)
+
+    def condyle_pressure_slopes(self, q: Array, data: KneeData | None = None) -> Array:
+        """Return the derivative (2, nv) of `condyle_pressures` by q, Pa/m and Pa/rad.
+
+        It is in the tangent space.
+
+        Raises:
+            InputError: see `condyle_pressures`; or the forces of the contact model jump from facet
+                to facet (`hertz`).
+            ComputationError: see `condyle_pressures`.
+        """
+        from tkamb.knee.smooth_peak import smooth_peak_slopes
+
+        contact, data = self._need_contact(), self.create_data() if data is None else data
+        twists = self.relative_jacobian(q, data)
+        twists = mirrored_spatial(twists.T).T if self.left else twists
+        return smooth_peak_slopes(contact, self.at(q, data).pose) @ twists
+
     def stiffness(
         self, q: Array, v: Array, data: KneeData | None = None, exact: bool = True
     ) -> Array:
