@@ -239,7 +239,8 @@ def lattice_case(read, name, newton):
     options = {"tolerance": 1e-9, "newton": newton, "cache": False}
     resolution = 3e-3 if newton else 2e-3
     knee = knee_of(read[0], name, resolution, options)
-    return Case(knee, lambda count: random_states(read, knee, count))
+    # The iteration stops before it follows a shorter step.
+    return Case(knee, lambda count: random_states(read, knee, count), steps=LONG)
 
 
 def hamstrings(plain):

@@ -18,12 +18,11 @@ from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
 from tkamb.errors import InputError
-from tkamb.geometry.frames import knee_pose, rotate
+from tkamb.geometry.frames import displaced, knee_pose, rotate
 from tkamb.geometry.post import divide_insert
 from tkamb.geometry.surface import Surface
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
-from tkamb.knee.contact import displaced
 from tkamb.knee.load import total_wrench, wrench_of
 from tkamb.knee.released_forces import external_wrench
 from tkamb.run.read_scene import contact_side, mechanics_of

@@ -15,7 +15,7 @@ from tkamb.contact.model import CondyleWrench, ContactModel, ProbedContact
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.result import ContactStatus, Guess
 from tkamb.errors import ComputationError, InputError
-from tkamb.geometry.frames import Array, cross, pose
+from tkamb.geometry.frames import Array, cross, displaced, pose
 from tkamb.knee.contact_points import CONTACT_POINT, CondylePoint
 from tkamb.knee.load import wrench_of
 
@@ -304,12 +304,3 @@ def differences(
         ]
         columns.append((wrenches[0] - wrenches[1]) / (2.0 * size))
     return np.array(columns).T
-
-
-def displaced(femur_pose: Array, displacement: Array) -> Array:
-    """Return a pose (4, 4) moved by a displacement (6,): translation, then rotation vector.
-
-    The rotation is about the insert's origin. All vectors are in the insert frame.
-    """
-    rotation = Rotation.from_rotvec(displacement[3:]).as_matrix()
-    return pose(rotation @ femur_pose[:3, :3], rotation @ femur_pose[:3, 3] + displacement[:3])
