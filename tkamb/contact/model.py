@@ -231,12 +231,9 @@ class Probe:
         return contact
 
     def exact_tangent(self, contact: ProbedContact) -> ProbedContact:
-        """Return the last contact with its exact tangent.
+        """Return a contact of this probe with its exact tangent.
 
         A model without one returns the contact unchanged.
-
-        Args:
-            contact: the last result of `at` or `seen`.
         """
         return contact
 

@@ -102,24 +102,10 @@ class KneeContact:
         return contact
 
     def with_exact_tangent(self, probe: Any, contact: ProbedContact) -> ProbedContact:
-        """Return the last contact of a probe with the model's exact tangent, if it has one."""
+        """Return a contact of a probe with the model's exact tangent, if it has one."""
         # A probe of another package needs no such method.
         tangent = getattr(probe, "exact_tangent", None)
         return contact if tangent is None else tangent(contact)
-
-    def exact_at(self, femur_pose: Array, contact: ProbedContact) -> ProbedContact:
-        """Return a contact with the model's exact tangent.
-
-        A lattice is evaluated once more; the foundation has the tangent already.
-
-        Args:
-            femur_pose: pose of the femoral component, shape (4, 4).
-            contact: the contact at this pose.
-        """
-        probe = self.probe()
-        if not hasattr(probe, "exact_tangent"):
-            return contact
-        return self.with_exact_tangent(probe, self.at(probe, femur_pose))
 
     def check_differentiable(self) -> None:
         """Raise an error unless the model's forces have derivatives.

@@ -597,7 +597,7 @@ class Knee(AssembledKnee):
         from tkamb.knee.solution_derivatives import ImplicitEquilibrium, exact_tangent
 
         model = self._need_contact()
-        contact = model.exact_at(knee_pose(knee.coordinates), knee.contact)
+        contact = model.with_exact_tangent(model.probe(), knee.contact)
         exact_tangent(contact, model.model.name)
         knee = replace(knee, contact=contact)
         slopes = ImplicitEquilibrium(search, instant, knee, points).derivatives()

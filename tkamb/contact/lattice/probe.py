@@ -12,7 +12,7 @@ set is constant. The real contact differs in both. So the forces come from `eval
 stiffness only gives the direction of a search.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -62,8 +62,6 @@ class LatticeProbe(Probe):
         self._lattice_model, self._accuracy = model, accuracy
         self._measured: tuple[Array, float] | None = None
         """Last pose at which the whole solid was evaluated, and norm of the forces there, N."""
-        self._last: tuple[ContactResult, LatticeStart, Index] | None = None
-        """Last contact with loaded nodes: its result, its warm start and these nodes."""
 
     def evaluated(self, pose: Array) -> tuple[ContactResult, WarmStart]:
         """Return the contact at a pose, and a warm start.
@@ -85,36 +83,33 @@ class LatticeProbe(Probe):
     def seen(self, result: ContactResult, start: WarmStart | None = None) -> ProbedContact:
         """Return the condyles' forces of a result, with their stiffness."""
         nodes = np.flatnonzero(result.nodal_force.any(axis=1))
-        solution, self._last = lattice_start(self._state, start), None
-        if len(nodes) and solution is None:
+        solution = lattice_start(self._state, start)
+        # The search of equilibrium takes the tangent of a linear material as exact.
+        exact = self._state.problem.solid.material.is_linear
+        if not len(nodes):
+            return ProbedContact({}, tangent=True, exact=exact, accuracy=self._accuracy)
+        if solution is None:
             condyles = condyle_wrenches(result, self._state.pair.split)
             return ProbedContact(condyles, accuracy=self._accuracy)
-        change = np.zeros((0, 3, 6))
-        if solution is not None and len(nodes):
-            self._last = result, solution, nodes
-            change = force_changes(self._state, result, solution.displacement, nodes)
-        # The search of equilibrium takes the tangent of a linear material as exact.
-        exact = not len(nodes) or self._state.problem.solid.material.is_linear
-        return self._with_changes(result, nodes, change, exact, with_centre=False)
+        solved = SolvedContact(result, solution, nodes)
+        change = force_changes(self._state, result, solution.displacement, nodes)
+        return self._with_changes(solved, change, exact, with_centre=False)
 
     def exact_tangent(self, contact: ProbedContact) -> ProbedContact:
-        """Return the last contact with the tangent of `tkamb.contact.lattice.exact_tangent`.
-
-        Args:
-            contact: the last result of `at` or `seen`.
-        """
-        if self._last is None:
+        """Return a contact of this probe with the tangent of `exact_tangent.py`."""
+        if not isinstance(contact, LatticeContact):
             return contact
         from tkamb.contact.lattice.exact_tangent import exact_force_changes
 
-        result, start, nodes = self._last
-        change = exact_force_changes(self._state, result, start, nodes)
-        return self._with_changes(result, nodes, change, exact=True, with_centre=True)
+        solved = contact.solved
+        change = exact_force_changes(self._state, solved.result, solved.start, solved.nodes)
+        return self._with_changes(solved, change, exact=True, with_centre=True)
 
     def _with_changes(
-        self, result: ContactResult, nodes: Index, change: Array, exact: bool, with_centre: bool
+        self, solved: "SolvedContact", change: Array, exact: bool, with_centre: bool
     ) -> ProbedContact:
         """Return the condyles of a result with the changes (m, 3, 6) of the forces on its nodes."""
+        result, nodes = solved.result, solved.nodes
         condyles = condyle_wrenches(result, self._state.pair.split)
         points, force = result.points[nodes], result.nodal_force[nodes]
         size = np.linalg.norm(force, axis=1)
@@ -131,7 +126,25 @@ class LatticeProbe(Probe):
                     growth /= size[on_side, None]
                     slope = away.T @ growth / size[on_side].sum()
                     condyles[side] = replace(condyles[side], centre_slope=slope)
-        return ProbedContact(condyles, tangent=True, exact=exact, accuracy=self._accuracy)
+        return LatticeContact(
+            condyles, tangent=True, exact=exact, accuracy=self._accuracy, solved=solved
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedContact:
+    """A contact that has converged, its warm start, and its loaded contact nodes (m,)."""
+
+    result: ContactResult
+    start: LatticeStart
+    nodes: Index
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LatticeContact(ProbedContact):
+    """The wrenches of a loaded contact, with the solution that its exact tangent needs."""
+
+    solved: SolvedContact
 
 
 def force_changes(
