@@ -12,7 +12,9 @@ By the implicit function theorem, with J0 and J1 of `pin.dIntegrate`,
 
 `CondyleForces` and `CondylePressures` are residuals for costs on the contact. If the model is
 out of its range, or Newton's method does not converge, the next state is NaN: the solver then
-shortens its step. Crocoddyl must fit the installed Pinocchio (`tkamb.crocoddyl_pair`).
+shortens its step. The models are Python objects: set `nthreads = 1` in a `ShootingProblem`, because
+a second thread of Crocoddyl ends the process. Crocoddyl must fit the installed Pinocchio
+(`tkamb.crocoddyl_pair`).
 
 Reference: Mastalli et al., Crocoddyl: an efficient and versatile framework for multi-contact
 optimal control, ICRA (2020), doi:10.1109/ICRA40945.2020.9196673.

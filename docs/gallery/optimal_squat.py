@@ -151,6 +151,7 @@ def squat(pressure_weight, xs, us):
 
     running = [node(STEP, 1e3 if k == NODES // 2 else 0.0) for k in range(NODES)]
     problem = crocoddyl.ShootingProblem(start, running, node(0.0, end_weight=1e2))
+    problem.nthreads = 1  # models in Python
     solver = crocoddyl.SolverFDDP(problem)
     solver.th_stop = 1e-6
     solver.setCallbacks([crocoddyl.CallbackVerbose()])
