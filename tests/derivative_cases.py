@@ -316,7 +316,7 @@ def mimic_case(read):
         for _ in range(count):
             q = rng.uniform(-1, 1, model.nq) * 0.02
             q[up], q[model.joints[model.getJointId("PZ")].idx_q] = 0.0, 1e-3 * rng.uniform(-1, 1)
-            height = knee.press(q, 1000.0 * rng.uniform(0.5, 1.5)).pose[1, 3]
+            height = knee.press(q, 1000.0 * rng.uniform(0.5, 1.5)).pose.translation[1]
             q[up] += height - knee.pose(q).translation[1]
             yield q, 0.1 * rng.standard_normal(model.nv)
 

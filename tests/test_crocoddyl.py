@@ -84,7 +84,7 @@ def action(control):
     ):
         costs.addCost(name, crocoddyl.CostModelResidual(state, residual), weight)
     q = np.array([0.1, -6.9e-3, 0.0, 0.5])
-    q[2] = knee.press(q, 800.0).pose[1, 3]
+    q[2] = knee.press(q, 800.0).pose.translation[1]
     x = np.concatenate([q, [0.1, 0.01, -0.01, 0.2]])
     dynamics = control.KneeDynamics(state, actuation, knee, costs, muscles=["quadriceps"])
     return dynamics, x, np.array([5.0, 1.0, -2.0, 3.0, 400.0])

@@ -272,13 +272,12 @@ def test_a_folder_in_use_is_refused(tmp_path):
 
 def test_a_full_disk_leaves_all_files_or_none(tmp_path, monkeypatch):
     uncertainty = estimate_uncertainty(bodies_alone(), samples=20, frames=slice(0, 1))
-    monkeypatch.setattr("tkamb.show.report.report_html", lambda results, progress=None: "page")
 
     def write(folder, number=None):
         folder.mkdir()
         injected = Faults(folder, number).injected(monkeypatch)
         with injected as faults, suppress(InputError):
-            write_uncertainty(uncertainty, folder)
+            write_uncertainty(uncertainty, folder, report=lambda results: "page")
         settle(folder)
         expected = {"bands.csv", "tornado.csv", "samples.h5", "results.csv", "summary.json"}
         return faults.calls, expected, expected & {path.name for path in folder.iterdir()}

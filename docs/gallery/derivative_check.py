@@ -39,7 +39,7 @@ knee = tkamb.Knee(
     friction=0.05,
 )
 q, v, tau = np.array([0.1, -6.9e-3, 0.0, 0.0, 0.02, 0.0, 0.4]), 0.1 * np.ones(7), np.zeros(7)
-q[2] = knee.press(q, 1000.0).pose[1, 3]
+q[2] = knee.press(q, 1000.0).pose.translation[1]
 
 # The check.
 exact = knee.forward_dynamics_derivatives(q, v, tau)[0]

@@ -35,7 +35,7 @@ for name, joint, place in (("femur", hip, thigh), ("tibia", shank, pin.SE3.Ident
 def collateral(name, z):
     """Return a ligament from epicondyle to shank."""
     ends = ("femur", (0.0, 0.0, z)), ("tibia", (0.0, -0.06, 0.8 * z))
-    return tkamb.Ligament(name, *ends, law="quadratic-toe", stiffness=3000.0, slack_length=0.088)
+    return tkamb.Ligament(name, *ends, tkamb.QuadraticToe(stiffness=3000.0), slack_length=0.088)
 
 
 ligaments = [collateral("MCL", -0.04), collateral("LCL", 0.04)]
@@ -57,12 +57,12 @@ def adductions(slack, derivatives=False):
     changed = knee.with_ligaments([replace(one, slack_length=length) for one, length in pairs])
     found, slopes, q = [], [], start
     for moment in moments:
-        external = pin.StdVec_Force([pin.Force.Zero()] * model.njoints)
-        external[shank] = pin.Force(np.array([0, 400.0, 0]), np.array([moment, 0, 0]))
+        fext = pin.StdVec_Force([pin.Force.Zero()] * model.njoints)
+        fext[shank] = pin.Force(np.array([0, 400.0, 0]), np.array([moment, 0, 0]))
         state = changed.equilibrium(
-            q, v, v, external, released=("ap", "ml", "adduction"), derivatives=derivatives
+            q, v, v, fext, released=("ap", "ml", "adduction"), derivatives=derivatives
         )
-        assert not state.problem, state.problem
+        assert not state.failed, state.reason
         calls += 1
         q = state.q
         found.append(state.coordinates[4])

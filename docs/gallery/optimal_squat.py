@@ -53,8 +53,7 @@ knee = tkamb.Knee(
             name,
             ("femur", (-0.004, 0.0, z)),
             ("tibia", (0.0, 0.34, z)),
-            law="quadratic-toe",
-            stiffness=4000.0,
+            tkamb.QuadraticToe(stiffness=4000.0),
             slack_length=0.058,
         )
         for name, z in (("MCL", -0.04), ("LCL", 0.04))
@@ -115,7 +114,7 @@ def upright(flexion, q):
 
 
 q = upright(np.radians(15.0), np.zeros(5))
-q[2] = knee.press(q, 400.0).pose[1, 3]
+q[2] = knee.press(q, 400.0).pose.translation[1]
 q, v, rest = held(q, np.array([0.0, 0.0, 300.0]))
 start = np.concatenate([q, v])
 xs, us = [start], []

@@ -61,6 +61,7 @@ def _uncertainty(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from tkamb.io.scene import load_scene
+    from tkamb.show.report import report_html
     from tkamb.studies.uncertainty.run import estimate_uncertainty
 
     overrides = overrides_of(options)
@@ -80,6 +81,7 @@ def _uncertainty(options: argparse.Namespace) -> int:
         resume=options.resume,
         force=options.force,
         progress=lambda samples, count: tqdm(samples, total=count, unit="sample", disable=None),
+        report=report_html,
     )
     for line in warnings_of(result):
         say(line)

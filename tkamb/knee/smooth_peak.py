@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from tkamb.contact.result import ContactStatus, medial_points
+from tkamb.contact.result import medial_points
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array
 from tkamb.knee.contact import CONTACT_DIFFERENCE, KneeContact, differences
@@ -40,8 +40,8 @@ def smooth_peaks(contact: KneeContact, femur_pose: Array) -> Array:
         ComputationError: the contact model is out of its range.
     """
     result = contact.model.evaluate(contact.state, femur_pose)
-    if result.status is ContactStatus.OUT_OF_RANGE:
-        raise ComputationError("; ".join(result.flags), "contact")
+    if result.failed:
+        raise ComputationError(result.reason, "contact")
     medial = medial_points(result.points, femur_pose, contact.pair.split)
     largest = max(float(result.pressure.max()), 1.0)
     share = result.area / SMOOTH_PEAK.area * (result.pressure / largest) ** SMOOTH_PEAK.order
