@@ -238,6 +238,12 @@ class KneeStep(crocoddyl.ActionModelAbstract):
             data.Fx, data.Fu = np.eye(2 * size), np.zeros((2 * size, self.nu))
             return
         end, h = data.xnext, self.step
+        if not np.isfinite(end).all():  # an error in a callback would end the process
+            data.Fx, data.Fu = (
+                np.full((2 * size,) * 2, np.nan),
+                np.full((2 * size, self.nu), np.nan),
+            )
+            return
         by_x, by_u = self.dynamics.acceleration_derivatives(inner, end, u)
         q, travel = x[: self.state.nq], h * end[self.state.nq :]
         first, second = pin.dIntegrate(self.dynamics.knee.model, q, travel)
@@ -261,27 +267,32 @@ class KneeStep(crocoddyl.ActionModelAbstract):
             at = np.concatenate([pin.integrate(model, q, h * velocity), velocity])
             return at, velocity - v - h * self.dynamics.acceleration(inner, at, u)
 
-        start = v if data.velocity is None else data.velocity
-        end, error = residual(start)
-        if not np.isfinite(error).all():
-            start = v
-            end, error = residual(start)
+        for guess in (data.velocity, v, np.zeros_like(v)):
+            end = None if guess is None else self._converged(inner, residual, guess, q, u)
+            if end is not None:
+                data.velocity = end[nq:]
+                return end
+        return None
+
+    def _converged(
+        self, inner: "KneeDynamicsData", residual: Any, guess: Array, q: Array, u: Array
+    ) -> Array | None:
+        """Return the next state by Newton's method from a guess of its velocity, or None."""
+        model, h, nq, count = self.dynamics.knee.model, self.step, self.state.nq, self.state.nv
+        end, error = residual(guess)
         for _ in range(self.max_newton_steps):
             size = float(np.abs(error).max())
             if not np.isfinite(size):
                 return None
             if size < self.velocity_tolerance:
-                data.velocity = end[nq:]
                 return end
             by_x, _ = self.dynamics.acceleration_derivatives(inner, end, u)
-            count = self.state.nv
             _, second = pin.dIntegrate(model, q, h * end[nq:])
             matrix = np.eye(count) - h * by_x[:, count:] - h**2 * by_x[:, :count] @ second
             change = np.linalg.solve(matrix, error)
             for share in (1.0, 0.5, 0.25, 0.1, 0.03):
                 trial, trial_error = residual(end[nq:] - share * change)
-                trial_size = float(np.abs(trial_error).max())
-                if trial_size < size:  # false for NaN
+                if float(np.abs(trial_error).max()) < size:  # false for NaN
                     break
             end, error = trial, trial_error
         return None
