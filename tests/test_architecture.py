@@ -13,7 +13,7 @@ ORDER = ("geometry", "contact", "knee", "io", "run", "studies", "show", "command
 """Folders from the lowest to the highest. Each imports only from lower ones and itself."""
 SERVES_ALL = {"errors", "files", "settings", "units"}
 """Modules that every folder may import."""
-ON_TOP = {"__init__", "__main__", "cli", "crocoddyl", "testing"}
+ON_TOP = {"__init__", "__main__", "cli", "crocoddyl", "crocoddyl_pair", "testing"}
 """Modules that may import every folder."""
 
 

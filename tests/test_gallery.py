@@ -5,13 +5,15 @@ from pathlib import Path
 
 import pytest
 
+from tkamb.errors import InputError
+
 GALLERY = Path(__file__).parents[1] / "docs" / "gallery"
 EXAMPLES = sorted(GALLERY.glob("*.py"))
 
 
 RECORDED = {"dm_gait": "dm", "jw_squat": "jw"}
 """Example -> subject of the recordings that it needs."""
-SLOW = {"cohort", "insert_shapes", "knee_drop", *RECORDED}
+SLOW = {"cohort", "insert_shapes", "knee_drop", "ligament_fit", "optimal_squat", *RECORDED}
 
 
 def marked(example):
@@ -28,6 +30,12 @@ def marked(example):
 def test_the_example_passes_its_assertions(example, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "Agg")
+    if "tkamb.crocoddyl" in example.read_text(encoding="utf-8"):
+        pytest.importorskip("crocoddyl")
+        try:
+            import tkamb.crocoddyl  # noqa: F401
+        except InputError as error:
+            pytest.skip(f"{error}: scripts/check_control runs this example")
     runpy.run_path(str(example))
     assert (tmp_path / f"{example.stem}.png").stat().st_size > 4000
     assert (GALLERY / f"{example.stem}.png").is_file(), "run scripts/make/gallery"

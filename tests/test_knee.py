@@ -10,8 +10,7 @@ import pytest
 import tkamb
 from knee_bodies import MIRROR, whole_body
 from tkamb.errors import ComputationError, InputError
-from tkamb.geometry.frames import cross, inverse
-from tkamb.knee.contact import displaced
+from tkamb.geometry.frames import cross, displaced, inverse
 
 SCENE = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
 FOUNDATION = {"contact.model": "foundation", "contact.resolution_mm": 2.0}

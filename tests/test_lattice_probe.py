@@ -8,6 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lattice_bodies import above, condyles, dished_insert, pair
+from tkamb.contact.lattice import model as lattice_model
+from tkamb.contact.lattice.linear import compliance
 from tkamb.contact.materials import material
 from tkamb.contact.registry import contact_model
 
@@ -43,6 +45,31 @@ def stiffness_by_differences(model, state, result, start):
         )
         stiffness[:, column] = (ahead - behind) / (2 * step)
     return stiffness
+
+
+@pytest.mark.parametrize("name", ["lattice-linear", "lattice", "fe"])
+def test_the_exact_tangent_is_the_derivative_of_the_wrench(name, monkeypatch):
+    """The reference is solved in double precision, and by full Newton steps."""
+    for module in (lattice_model, compliance):
+        monkeypatch.setattr(module, "SINGLE", np.float64)
+    newton = name != "lattice-linear"
+    model = replace(contact_model(name, 3.0), tolerance=1e-9, newton=newton, cache=False)
+    state = model.prepare(pair(condyles(), dished_insert(), material("polyethylene")))
+    result, start = model.press_from(state, 800.0, above(x=0.5e-3, y=0.03))
+    probe = model.probe(state, start)
+    exact = sum(load.stiffness for load in probe.exact_tangent(probe.at(result.pose)).loads)
+    for column in (0, 1, 3):  # AP, SI and adduction
+        errors = []
+        # The iteration stops before it follows a shorter step; a longer one may meet a kink.
+        for step in (1e-7, 1e-6):
+            twist = np.eye(6)[column] * (step if column < 3 else 40.0 * step)
+            ahead, behind = (
+                model.evaluate(state, moved(result.pose, sign * twist)).wrench_on_insert
+                for sign in (1, -1)
+            )
+            slope = (ahead - behind) / (2.0 * twist[column])
+            errors.append(np.abs(exact[:, column] - slope).max() / np.abs(slope).max())
+        assert min(errors) < 1e-5, (column, errors)
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,11 @@ By the implicit function theorem, with J0 and J1 of `pin.dIntegrate`,
 
     (I - h a_v - h² a_q J1) dv' = dv + h a_q J0 dq + h a_u du.
 
-`CondyleForces` is a residual for a cost on the contact forces. If the contact model is out of its
-range, or Newton's method does not converge, the next state is NaN: the solver then shortens its
-step.
+`CondyleForces` and `CondylePressures` are residuals for costs on the contact. If the model is
+out of its range, or Newton's method does not converge, the next state is NaN: the solver then
+shortens its step. The models are Python objects: set `nthreads = 1` in a `ShootingProblem`, because
+a second thread of Crocoddyl ends the process. Crocoddyl must fit the installed Pinocchio
+(`tkamb.crocoddyl_pair`).
 
 Reference: Mastalli et al., Crocoddyl: an efficient and versatile framework for multi-contact
 optimal control, ICRA (2020), doi:10.1109/ICRA40945.2020.9196673.
@@ -24,6 +26,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from tkamb.crocoddyl_pair import checked
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array
 from tkamb.knee.knee import Knee
@@ -36,6 +39,7 @@ except ImportError as error:
         "tkamb.crocoddyl",
         'install it: pip install "tkamb[control]"',
     ) from error
+checked(crocoddyl.__version__, pin.__version__)
 
 
 class KneeDynamics(crocoddyl.DifferentialActionModelAbstract):
@@ -234,6 +238,12 @@ class KneeStep(crocoddyl.ActionModelAbstract):
             data.Fx, data.Fu = np.eye(2 * size), np.zeros((2 * size, self.nu))
             return
         end, h = data.xnext, self.step
+        if not np.isfinite(end).all():  # an error in a callback would end the process
+            data.Fx, data.Fu = (
+                np.full((2 * size,) * 2, np.nan),
+                np.full((2 * size, self.nu), np.nan),
+            )
+            return
         by_x, by_u = self.dynamics.acceleration_derivatives(inner, end, u)
         q, travel = x[: self.state.nq], h * end[self.state.nq :]
         first, second = pin.dIntegrate(self.dynamics.knee.model, q, travel)
@@ -257,27 +267,32 @@ class KneeStep(crocoddyl.ActionModelAbstract):
             at = np.concatenate([pin.integrate(model, q, h * velocity), velocity])
             return at, velocity - v - h * self.dynamics.acceleration(inner, at, u)
 
-        start = v if data.velocity is None else data.velocity
-        end, error = residual(start)
-        if not np.isfinite(error).all():
-            start = v
-            end, error = residual(start)
+        for guess in (data.velocity, v, np.zeros_like(v)):
+            end = None if guess is None else self._converged(inner, residual, guess, q, u)
+            if end is not None:
+                data.velocity = end[nq:]
+                return end
+        return None
+
+    def _converged(
+        self, inner: "KneeDynamicsData", residual: Any, guess: Array, q: Array, u: Array
+    ) -> Array | None:
+        """Return the next state by Newton's method from a guess of its velocity, or None."""
+        model, h, nq, count = self.dynamics.knee.model, self.step, self.state.nq, self.state.nv
+        end, error = residual(guess)
         for _ in range(self.max_newton_steps):
             size = float(np.abs(error).max())
             if not np.isfinite(size):
                 return None
             if size < self.velocity_tolerance:
-                data.velocity = end[nq:]
                 return end
             by_x, _ = self.dynamics.acceleration_derivatives(inner, end, u)
-            count = self.state.nv
             _, second = pin.dIntegrate(model, q, h * end[nq:])
             matrix = np.eye(count) - h * by_x[:, count:] - h**2 * by_x[:, :count] @ second
             change = np.linalg.solve(matrix, error)
             for share in (1.0, 0.5, 0.25, 0.1, 0.03):
                 trial, trial_error = residual(end[nq:] - share * change)
-                trial_size = float(np.abs(trial_error).max())
-                if trial_size < size:  # false for NaN
+                if float(np.abs(trial_error).max()) < size:  # false for NaN
                     break
             end, error = trial, trial_error
         return None
@@ -292,11 +307,10 @@ class KneeStepData(crocoddyl.ActionDataAbstract):
         self.velocity: Array | None = None
 
 
-class CondyleForces(crocoddyl.ResidualModelAbstract):
-    """Residual: the contact forces of the medial and the lateral condyle, N, shape (2,).
+class _CondyleResidual(crocoddyl.ResidualModelAbstract):
+    """Residual of one value per condyle, medial and lateral, that depends on q alone.
 
-    The forces depend on q alone. They are NaN if the contact model is out of its range. The contact
-    model needs an exact tangent, as the foundation has.
+    The values are NaN if the contact model is out of its range.
 
     Args:
         state: `crocoddyl.StateMultibody` of `knee.model`.
@@ -310,15 +324,54 @@ class CondyleForces(crocoddyl.ResidualModelAbstract):
         self._data = knee.create_data()
 
     def calc(self, data: Any, x: Array, u: Array | None = None) -> None:
-        """Set the forces."""
-        data.r = self._forces(x)[0]
+        """Set the values."""
+        try:
+            data.r = self._values(x[: self.state.nq])
+        except ComputationError:
+            data.r = np.full(2, np.nan)
 
     def calcDiff(self, data: Any, x: Array, u: Array | None = None) -> None:
-        """Set the derivative of the forces by x."""
-        data.Rx[:, :] = np.hstack([self._forces(x)[1], np.zeros((2, self.state.nv))])
-
-    def _forces(self, x: Array) -> tuple[Array, Array]:
+        """Set the derivative of the values by x."""
         try:
-            return self.knee.condyle_forces(x[: self.state.nq], self._data)
+            by_q = self._slopes(x[: self.state.nq])
         except ComputationError:
-            return np.full(2, np.nan), np.full((2, self.state.nv), np.nan)
+            by_q = np.full((2, self.state.nv), np.nan)
+        data.Rx[:, :] = np.hstack([by_q, np.zeros((2, self.state.nv))])
+
+    def _values(self, q: Array) -> Array:
+        raise NotImplementedError
+
+    def _slopes(self, q: Array) -> Array:
+        raise NotImplementedError
+
+
+class CondyleForces(_CondyleResidual):
+    """Residual: the contact forces of the medial and the lateral condyle, N, shape (2,).
+
+    The contact model needs an exact tangent, as foundation and lattices have. The arguments are
+    those of `CondylePressures`.
+    """
+
+    def _values(self, q: Array) -> Array:
+        return self.knee.condyle_forces(q, self._data)[0]
+
+    def _slopes(self, q: Array) -> Array:
+        return self.knee.condyle_forces(q, self._data)[1]
+
+
+class CondylePressures(_CondyleResidual):
+    """Residual: smooth peak pressures of the medial and the lateral condyle, Pa, shape (2,).
+
+    `tkamb.knee.smooth_peak` has the equation.
+
+    Args:
+        state: `crocoddyl.StateMultibody` of `knee.model`.
+        knee: a knee with a contact model.
+        nu: number of controls.
+    """
+
+    def _values(self, q: Array) -> Array:
+        return self.knee.condyle_pressures(q, self._data)
+
+    def _slopes(self, q: Array) -> Array:
+        return self.knee.condyle_pressure_slopes(q, self._data)

@@ -160,6 +160,8 @@ class Hertz(ContactModel):
     name: ClassVar[str] = "hertz"
     assumes: ClassVar[str] = "two smooth bodies of constant curvature, linear elastic half-space"
     needs: ClassVar[str] = "condyles that do not conform to the insert; milliseconds"
+    # Point and curvatures of first touch change from facet to facet.
+    differentiable: ClassVar[bool] = False
 
     resolution: float = 1e-3
     patch_radius: float = 4e-3

@@ -36,12 +36,15 @@ class ContactModel(ABC):
     time, and changes the result by no more than the tolerance. A model stores nothing between
     calls. `mobile_bearing` is True if the bottom of a mobile bearing slides. If it is False, the
     model presses a mobile bearing like a fixed one, and presses and runs state this in a note.
+    `differentiable` is False if the forces jump between neighbouring poses. A derivative of the
+    forces is then refused.
     """
 
     name: ClassVar[str]
     assumes: ClassVar[str]
     needs: ClassVar[str]
     mobile_bearing: ClassVar[bool] = False
+    differentiable: ClassVar[bool] = True
 
     resolution: float
 
@@ -224,6 +227,13 @@ class Probe:
         Args:
             pose: (4, 4) pose_femoral_in_insert.
             contact: contact at that pose.
+        """
+        return contact
+
+    def exact_tangent(self, contact: ProbedContact) -> ProbedContact:
+        """Return a contact of this probe with its exact tangent.
+
+        A model without one returns the contact unchanged.
         """
         return contact
 

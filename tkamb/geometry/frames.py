@@ -198,3 +198,14 @@ def sagittal_pose(coordinates: Array) -> Array:
     result = np.eye(4)
     result[:2, :2], result[:2, 3] = [[c, -s], [s, c]], [ap, si]
     return result
+
+
+def displaced(femur_pose: Array, displacement: Array) -> Array:
+    """Return a pose (4, 4) moved by a displacement (6,): translation, then rotation vector.
+
+    The rotation is about the insert's origin. All vectors are in the insert frame.
+    """
+    from scipy.spatial.transform import Rotation
+
+    rotation = Rotation.from_rotvec(displacement[3:]).as_matrix()
+    return pose(rotation @ femur_pose[:3, :3], rotation @ femur_pose[:3, 3] + displacement[:3])

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from tkamb.contact.model import CondyleWrench, ContactModel, ProbedContact
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.result import ContactStatus, Guess
-from tkamb.errors import ComputationError
-from tkamb.geometry.frames import Array, cross, pose
+from tkamb.errors import ComputationError, InputError
+from tkamb.geometry.frames import Array, cross, displaced, pose
 from tkamb.knee.contact_points import CONTACT_POINT, CondylePoint
 from tkamb.knee.load import wrench_of
 
@@ -100,6 +100,25 @@ class KneeContact:
         if not contact.known:
             raise ComputationError(self._why(femur_pose), "contact")
         return contact
+
+    def with_exact_tangent(self, probe: Any, contact: ProbedContact) -> ProbedContact:
+        """Return a contact of a probe with the model's exact tangent, if it has one."""
+        # A probe of another package needs no such method.
+        tangent = getattr(probe, "exact_tangent", None)
+        return contact if tangent is None else tangent(contact)
+
+    def check_differentiable(self) -> None:
+        """Raise an error unless the model's forces have derivatives.
+
+        Raises:
+            InputError: they jump from facet to facet.
+        """
+        if not self.model.differentiable:
+            raise InputError(
+                f"the forces of contact model '{self.model.name}' jump from facet to facet",
+                "derivatives",
+                "take the foundation or a lattice; Knee.stiffness is the slope over 8 µm",
+            )
 
     def _why(self, femur_pose: Array) -> str:
         """Return the reason why the model failed at a pose (4, 4)."""
@@ -204,6 +223,11 @@ class KneeContact:
             twist: constant twist of the femur, shape (6,).
             exact: True: central differences replace an approximate tangent of the model.
         """
+        if exact:
+            if not contact.exact:
+                probe = self.precise_probe(getattr(probe, "start", None))
+                contact = self.at(probe, femur_pose)
+            contact = self.with_exact_tangent(probe, contact)
         has_friction = bool(self.friction and np.any(twist) and contact.loads)
         # The friction force moves with the centre of pressure. If its derivative is unknown, the
         # exact stiffness needs finite differences.
@@ -266,12 +290,3 @@ def differences(
         ]
         columns.append((wrenches[0] - wrenches[1]) / (2.0 * size))
     return np.array(columns).T
-
-
-def displaced(femur_pose: Array, displacement: Array) -> Array:
-    """Return a pose (4, 4) moved by a displacement (6,): translation, then rotation vector.
-
-    The rotation is about the insert's origin. All vectors are in the insert frame.
-    """
-    rotation = Rotation.from_rotvec(displacement[3:]).as_matrix()
-    return pose(rotation @ femur_pose[:3, :3], rotation @ femur_pose[:3, 3] + displacement[:3])

@@ -95,6 +95,8 @@ def force_derivatives(
     knee: "Knee", q: Array, v: Array, tensions: Any, data: "KneeData"
 ) -> tuple[Array, Array]:
     """Return the result of `Knee.external_forces_derivatives`."""
+    if knee.contact is not None:
+        knee.contact.check_differentiable()
     twists = relative_twists(knee, q, data)
     kinematics = knee._kinematics(data, q, v)
     muscle_tensions = knee._tensions(tensions)

@@ -214,6 +214,7 @@ class Knee(AssembledKnee):
         twists = self.relative_jacobian(q, data)
         twists = mirrored_spatial(twists.T).T if self.left else twists
         probed = self._contact_at(data, self._kinematics(data, q))
+        probed = contact.with_exact_tangent(data.probe, probed)
         if not (probed.tangent and probed.exact):
             raise InputError(f"{contact.model.name} has no exact tangent", "condyle_forces")
         forces, slopes = np.zeros(2), np.zeros((2, self.model.nv))
@@ -222,6 +223,37 @@ class Knee(AssembledKnee):
                 forces[k] = probed.condyles[side].force
                 slopes[k] = probed.condyles[side].force_slope @ twists
         return forces, slopes
+
+    def condyle_pressures(self, q: Array, data: KneeData | None = None) -> Array:
+        """Return the smooth peak pressures (2,), Pa, of medial and lateral condyle at q.
+
+        `tkamb.knee.smooth_peak` has the equation.
+
+        Raises:
+            InputError: the knee has no contact model.
+            ComputationError: the contact model is out of its range.
+        """
+        from tkamb.knee.smooth_peak import smooth_peaks
+
+        contact, data = self._need_contact(), self._data(data)
+        return smooth_peaks(contact, self._kinematics(data, q).pose)
+
+    def condyle_pressure_slopes(self, q: Array, data: KneeData | None = None) -> Array:
+        """Return the derivative (2, nv) of `condyle_pressures` by q, Pa/m and Pa/rad.
+
+        It is in the tangent space.
+
+        Raises:
+            InputError: see `condyle_pressures`; or the forces of the contact model jump from facet
+                to facet (`hertz`).
+            ComputationError: see `condyle_pressures`.
+        """
+        from tkamb.knee.smooth_peak import smooth_peak_slopes
+
+        contact, data = self._need_contact(), self._data(data)
+        twists = self.relative_jacobian(q, data)
+        twists = mirrored_spatial(twists.T).T if self.left else twists
+        return smooth_peak_slopes(contact, self._kinematics(data, q).pose) @ twists
 
     def stiffness(
         self, q: Array, v: Array, data: KneeData | None = None, exact: bool = True
@@ -290,7 +322,8 @@ class Knee(AssembledKnee):
             joint's force in its joint's frame, N and N·m per m, rad, m/s or rad/s.
 
         Raises:
-            InputError: see `external_forces`.
+            InputError: see `external_forces`; or the forces of the contact model jump from facet to
+                facet (`hertz`).
             ComputationError: see `external_forces`.
         """
         from tkamb.knee.derivatives import force_derivatives
@@ -500,7 +533,8 @@ class Knee(AssembledKnee):
         contact = self._need_contact()
         if result.failed:
             raise ComputationError(result.reason, "press")
-        probed = contact.probe(start).seen(result, start)
+        probe = contact.probe(start)
+        probed = contact.with_exact_tangent(probe, probe.seen(result, start))
         exact_tangent(probed, contact.model.name)
         slopes = press_derivatives(contact.pair, result.pose, probed)
         return replace(slopes, by_pose=mirrored_spatial(slopes.by_pose)) if self.left else slopes
@@ -621,7 +655,10 @@ class Knee(AssembledKnee):
             exact_tangent,
         )
 
-        exact_tangent(knee.contact, self._need_contact().model.name)
+        model = self._need_contact()
+        contact = model.with_exact_tangent(model.probe(), knee.contact)
+        exact_tangent(contact, model.model.name)
+        knee = replace(knee, contact=contact)
         slopes = ImplicitEquilibrium(search, instant, knee, points).derivatives()
         if self.left:
             signs = self._coordinate_signs

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from tkamb.errors import InputError
-from tkamb.geometry.frames import SIDES, Array, knee_axes, knee_pose
-from tkamb.knee.contact import DifferenceSettings, displaced
+from tkamb.geometry.frames import SIDES, Array, displaced, knee_axes, knee_pose
+from tkamb.knee.contact import DifferenceSettings
 
 if TYPE_CHECKING:
     from tkamb.contact.model import ProbedContact
@@ -58,7 +58,7 @@ def exact_tangent(contact: "ProbedContact", name: str) -> None:
         raise InputError(
             f"contact model '{name}' has no exact tangent",
             "derivatives",
-            "take the foundation, or a lattice with a linear material",
+            "take the foundation or a lattice",
         )
 
 

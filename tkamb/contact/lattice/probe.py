@@ -12,12 +12,12 @@ set is constant. The real contact differs in both. So the forces come from `eval
 stiffness only gives the direction of a search.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 
-from tkamb.contact.lattice.initial_guess import lattice_start
+from tkamb.contact.lattice.initial_guess import LatticeStart, lattice_start
 from tkamb.contact.lattice.problem import ContactProblem, LatticeState
 from tkamb.contact.model import Probe, ProbedContact, condyle_wrenches
 from tkamb.contact.pressing import Presses
@@ -82,16 +82,37 @@ class LatticeProbe(Probe):
 
     def seen(self, result: ContactResult, start: WarmStart | None = None) -> ProbedContact:
         """Return the condyles' forces of a result, with their stiffness."""
-        condyles = condyle_wrenches(result, self._state.pair.split)
-        exact = self._state.problem.solid.material.is_linear
         nodes = np.flatnonzero(result.nodal_force.any(axis=1))
         solution = lattice_start(self._state, start)
+        # The search of equilibrium takes the tangent of a linear material as exact.
+        exact = self._state.problem.solid.material.is_linear
         if not len(nodes):
-            return ProbedContact(condyles, tangent=True, exact=exact, accuracy=self._accuracy)
+            return ProbedContact({}, tangent=True, exact=exact, accuracy=self._accuracy)
         if solution is None:
+            condyles = condyle_wrenches(result, self._state.pair.split)
             return ProbedContact(condyles, accuracy=self._accuracy)
+        solved = SolvedContact(result, solution, nodes)
         change = force_changes(self._state, result, solution.displacement, nodes)
-        points = result.points[nodes]
+        return self._with_changes(solved, change, exact, with_centre=False)
+
+    def exact_tangent(self, contact: ProbedContact) -> ProbedContact:
+        """Return a contact of this probe with the tangent of `exact_tangent.py`."""
+        if not isinstance(contact, LatticeContact):
+            return contact
+        from tkamb.contact.lattice.exact_tangent import exact_force_changes
+
+        solved = contact.solved
+        change = exact_force_changes(self._state, solved.result, solved.start, solved.nodes)
+        return self._with_changes(solved, change, exact=True, with_centre=True)
+
+    def _with_changes(
+        self, solved: "SolvedContact", change: Array, exact: bool, with_centre: bool
+    ) -> ProbedContact:
+        """Return the condyles of a result with the changes (m, 3, 6) of the forces on its nodes."""
+        result, nodes = solved.result, solved.nodes
+        condyles = condyle_wrenches(result, self._state.pair.split)
+        points, force = result.points[nodes], result.nodal_force[nodes]
+        size = np.linalg.norm(force, axis=1)
         medial = medial_points(points, result.pose, self._state.pair.split)
         for side, on_side in (("medial", medial), ("lateral", ~medial)):
             if side in condyles:
@@ -99,7 +120,31 @@ class LatticeProbe(Probe):
                 moment = np.cross(points[on_side, :, None], part, axis=1)
                 stiffness = np.vstack([part.sum(axis=0), moment.sum(axis=0)])
                 condyles[side] = replace(condyles[side], stiffness=stiffness)
-        return ProbedContact(condyles, tangent=True, exact=exact, accuracy=self._accuracy)
+                if with_centre:  # the centre is sum(x |f|) / sum(|f|) over the nodes
+                    away = points[on_side] - condyles[side].centre
+                    growth = np.einsum("ia,iak->ik", force[on_side], part)
+                    growth /= size[on_side, None]
+                    slope = away.T @ growth / size[on_side].sum()
+                    condyles[side] = replace(condyles[side], centre_slope=slope)
+        return LatticeContact(
+            condyles, tangent=True, exact=exact, accuracy=self._accuracy, solved=solved
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedContact:
+    """A contact that has converged, its warm start, and its loaded contact nodes (m,)."""
+
+    result: ContactResult
+    start: LatticeStart
+    nodes: Index
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LatticeContact(ProbedContact):
+    """The wrenches of a loaded contact, with the solution that its exact tangent needs."""
+
+    solved: SolvedContact
 
 
 def force_changes(

@@ -1,0 +1,194 @@
+"""An optimal squat, with and without contact pressure in its cost.
+
+A planar leg stands on its fixed foot and carries half of the trunk. Crocoddyl finds the torques at
+ankle and hip and the tension of the quadriceps that bend the knee to 80 degrees and stretch it
+again. The second motion also pays for the peak pressure on the polyethylene. Both solutions begin
+at a squat with an upright trunk, whose forces come from inverse dynamics.
+"""
+
+import time
+from pathlib import Path
+
+import crocoddyl
+import matplotlib.pyplot as plt
+import numpy as np
+import pinocchio as pin
+import trimesh
+
+import tkamb
+from tkamb.crocoddyl import CondylePressures, KneeDynamics, KneeStep
+
+FILES = Path(tkamb.__file__).parent / "io" / "starter" / "files"
+NODES, STEP, DEEPEST = 24, 0.05, np.radians(80.0)  # steps of 50 ms; deepest knee flexion
+femoral, insert = (
+    trimesh.load(FILES / f"{name}.stl").apply_scale(1e-3)
+    for name in ("femoral_component", "insert")
+)
+
+model, joint = pin.Model(), 0  # x forward, y up
+model.gravity = pin.Motion(np.array([0, -9.81, 0, 0, 0, 0]))
+for name, kind, height, body in (  # height on the last joint (m); mass (kg), its height, inertia
+    ("ankle", "RZ", 0.0, (3.6, 0.24, 0.05)),
+    ("knee_ap", "PX", 0.40, None),
+    ("knee_si", "PY", 0.0, None),
+    ("knee_flexion", "RZ", 0.0, (8.0, 0.24, 0.13)),
+    ("trunk", "RZ", 0.42, (25.0, 0.28, 1.2)),
+):
+    place = pin.SE3(np.eye(3), np.array([0, height, 0]))
+    joint = model.addJoint(joint, getattr(pin, f"JointModel{kind}")(), place, name)
+    if body is not None:
+        mass, centre, inertia = body
+        inertia = pin.Inertia(mass, np.array([0, centre, 0]), inertia * np.eye(3))
+        model.appendBodyToJoint(joint, inertia, pin.SE3.Identity())
+for name, joint, height in (("tibia", 1, 0.0), ("insert", 1, 0.40), ("femur", 4, 0.0)):
+    place = pin.SE3(np.eye(3), np.array([0, height, 0]))
+    model.addFrame(pin.Frame(name, joint, 0, place, pin.FrameType.BODY))
+points = (("femur", (0.03, 0.20, 0)), ("femur", (0.038, -0.012, 0)), ("tibia", (0.036, 0.345, 0)))
+knee = tkamb.Knee(
+    model,
+    implant=tkamb.Implant(femoral, insert),
+    contact=tkamb.contact_model("foundation", resolution=2e-3),
+    ligaments=[
+        tkamb.Ligament(
+            name,
+            ("femur", (-0.004, 0.0, z)),
+            ("tibia", (0.0, 0.34, z)),
+            tkamb.QuadraticToe(stiffness=4000.0),
+            slack_length=0.058,
+        )
+        for name, z in (("MCL", -0.04), ("LCL", 0.04))
+    ],
+    muscles=[tkamb.Muscle("quadriceps", points)],
+)
+state, data = crocoddyl.StateMultibody(model), knee.create_data()
+DRIVEN = np.eye(5)[:, [0, 4]]  # torques at ankle and hip
+
+
+class Torques(crocoddyl.ActuationModelAbstract):
+    """Torques at ankle and hip."""
+
+    def calc(self, data, x, u=None):
+        """Set the torques."""
+        data.tau = data.dtau_du @ u if u is not None else np.zeros(5)
+
+    def calcDiff(self, data, x, u=None):
+        """The torques do not depend on x."""
+
+    def createData(self):
+        """Return data with the constant derivative by u."""
+        data = crocoddyl.ActuationDataAbstract(self)
+        data.dtau_du = DRIVEN
+        return data
+
+
+def held(q, u, last=None):
+    """Return q and controls u with the wanted flexion, by Newton's method.
+
+    The translations of the knee and u make the accelerations those of an implicit Euler step from
+    the state `last`; without it, zero.
+    """
+    for _ in range(60):
+        v = np.zeros(5) if last is None else (q - last[:5]) / STEP
+        wanted = np.zeros(5) if last is None else (v - last[5:]) / STEP
+        tensions, more = {"quadriceps": u[2]}, {"quadriceps": u[2] + 1.0}
+        args = q, v, DRIVEN @ u[:2]
+        a = knee.forward_dynamics(*args, tensions=tensions, data=data)
+        if np.abs(a - wanted).max() < 1e-6:
+            return q, v, u
+        by_q, by_v, by_tau = knee.forward_dynamics_derivatives(*args, tensions=tensions, data=data)
+        by_pull = knee.forward_dynamics(*args, tensions=more, data=data) - a
+        if last is not None:
+            by_q = by_q + by_v / STEP - np.eye(5) / STEP**2
+        step = np.linalg.solve(
+            np.column_stack([by_q[:, 1:3], by_tau @ DRIVEN, by_pull]), wanted - a
+        )
+        step *= min(1.0, 2e-4 / np.abs(step[:2]).max())
+        q, u = q + np.array([0.0, *step[:2], 0.0, 0.0]), u + step[2:]
+        u[2] = max(u[2], 0.0)
+    raise RuntimeError("no equilibrium")
+
+
+def upright(flexion, q):
+    """Return q with a flexion, the hip above the ankle and the trunk upright."""
+    return np.array([-flexion / 2, q[1], q[2], flexion, -flexion / 2])
+
+
+q = upright(np.radians(15.0), np.zeros(5))
+q[2] = knee.press(q, 400.0).pose.translation[1]
+q, v, rest = held(q, np.array([0.0, 0.0, 300.0]))
+start = np.concatenate([q, v])
+xs, us = [start], []
+for k in range(1, NODES + 1):
+    bend = q[3] + (DEEPEST - q[3]) * 0.5 * (1.0 - np.cos(2.0 * np.pi * k / NODES))
+    place, rate, control = held(upright(bend, xs[-1]), us[-1] if us else rest, xs[-1])
+    xs.append(np.concatenate([place, rate]))
+    us.append(control)
+
+
+def squat(pressure_weight, xs, us):
+    """Return the solver after it has found a squat, from a first guess of states and controls."""
+
+    def node(step, bend_weight=0.0, end_weight=0.0):
+        costs = crocoddyl.CostModelSum(state, 3)
+
+        def add(name, residual, weights, weight):
+            activation = crocoddyl.ActivationModelWeightedQuad(np.asarray(weights, float))
+            costs.addCost(name, crocoddyl.CostModelResidual(state, activation, residual), weight)
+
+        control = crocoddyl.ResidualModelControl(state, rest)
+        posture = crocoddyl.ResidualModelState(state, start, 3)
+        bent = crocoddyl.ResidualModelState(state, np.array([0, 0, 0, DEEPEST, *np.zeros(6)]), 3)
+        pressure = CondylePressures(state, knee, 3)
+        add("controls", control, [50.0**-2, 50.0**-2, 1000.0**-2], 1.0)  # N·m and N
+        add("posture", posture, [0.3, 0, 0, 0.3, 0.3, 0.1, 0.1, 0.1, 0.1, 0.1], 1.0)
+        add("end", posture, [1, 0, 0, 1, 1, 1, 1, 1, 1, 1], end_weight)
+        add("bend", bent, [0, 0, 0, 1, 0, 0, 0, 0, 0, 0], bend_weight)
+        if pressure_weight:
+            add("pressure", pressure, [10e6**-2] * 2, pressure_weight)  # Pa
+        dynamics = KneeDynamics(state, Torques(state, 2), knee, costs, muscles=["quadriceps"])
+        return KneeStep(dynamics, step)
+
+    running = [node(STEP, 1e3 if k == NODES // 2 else 0.0) for k in range(NODES)]
+    problem = crocoddyl.ShootingProblem(start, running, node(0.0, end_weight=1e2))
+    problem.nthreads = 1  # models in Python
+    solver = crocoddyl.SolverFDDP(problem)
+    solver.th_stop = 1e-6
+    solver.setCallbacks([crocoddyl.CallbackVerbose()])
+    solver.solve(xs, us, 60, True)
+    return solver
+
+
+began, solvers = time.perf_counter(), {}
+for name, weight in (("without pressure", 0.0), ("with pressure", 1.0)):
+    solvers[name] = squat(weight, xs, us)
+    xs, us = list(solvers[name].xs), list(solvers[name].us)
+seconds = time.perf_counter() - began
+
+figure, axes = plt.subplots(1, 4, figsize=(11.0, 3.2), layout="constrained")
+instants, peaks = STEP * np.arange(NODES + 1), []
+for colour, (name, solver) in zip(("#0072B2", "#D55E00"), solvers.items(), strict=True):
+    states = np.array(solver.xs)
+    contacts = [knee.evaluate(x[:5]) for x in states]
+    sides = [[one for one in (c.medial, c.lateral) if one is not None] for c in contacts]
+    pressure = [1e-6 * max(one.peak_pressure for one in pair) for pair in sides]
+    peaks.append(max(pressure))
+    axes[0].plot(instants, np.degrees(states[:, 3]), color=colour, label=name)
+    axes[1].plot(instants, [sum(one.force for one in pair) for pair in sides], color=colour)
+    axes[2].plot(instants, pressure, color=colour)
+    middle = model.createData()
+    pin.forwardKinematics(model, middle, states[NODES // 2, :5])
+    head = middle.oMi[5].act(np.array([0.0, 0.5, 0.0]))
+    chain = np.array([middle.oMi[j].translation for j in (1, 4, 5)] + [head])
+    axes[3].plot(chain[:, 0], chain[:, 1], "o-", color=colour)
+labels = "knee flexion (deg)", "contact force (N)", "peak pressure (MPa)", "height (m)"
+for ax, label in zip(axes, labels, strict=True):
+    ax.set(xlabel="time (s)", ylabel=label)
+axes[3].set(xlabel="forward (m)", title="at the deepest point", aspect="equal")
+axes[0].legend(fontsize=7)
+figure.savefig("optimal_squat.png", dpi=100)
+
+for name, solver in solvers.items():
+    print(f"{name}: {solver.iter} iterations, stop {solver.stop:.1e}")
+print(f"{seconds:.0f} s; peak pressure {peaks[0]:.1f} and {peaks[1]:.1f} MPa")
+assert all(solver.stop <= 1e-6 for solver in solvers.values())
+assert peaks[1] < 0.95 * peaks[0], peaks
