@@ -239,7 +239,7 @@ def test_power_is_the_same_in_both_frames():
 
 @pytest.fixture(scope="module")
 def knee(tmp_path_factory):
-    """Return a function from released coordinates to the recording of the shipped bend with a cam."""
+    """Return a function from released coordinates to the shipped bend with a cam."""
     folder = tmp_path_factory.mktemp("bend")
     DESIGN.write_meshes(folder / "ps")
     changes = {

@@ -193,7 +193,7 @@ class FrameMethod:
             InputError: the contact model cannot use the meshes.
         """
         if self.knee.contact is not None:
-            self._contact.state  # noqa: B018
+            self._state  # noqa: B018
             self.cam  # noqa: B018
 
     @property
@@ -203,6 +203,10 @@ class FrameMethod:
         return contact
 
     @cached_property
+    def _state(self) -> Any:
+        return self._contact.state
+
+    @cached_property
     def cam(self) -> "CamPost | None":
         """Prepared contact of cam and post; None: not modelled."""
         if self.post is None:
@@ -210,14 +214,14 @@ class FrameMethod:
         from tkamb.contact.cam_post import CamPost
 
         contact, ready = self._contact, self.ready_cam
-        material, pair = contact.state.pair.material, contact.pair
+        material, pair = self._state.pair.material, contact.pair
         if ready is not None:
             return ready if ready.material == material else ready.of_material(material)
         return CamPost(contact.model, pair.femoral, self.post, pair.split, material)
 
     @cached_property
     def _probe(self) -> Any:
-        return self._contact.model.probe(self._contact.state)
+        return self._contact.model.probe(self._state)
 
     @cached_property
     def search(self) -> "ReleasedKnee":
@@ -232,7 +236,7 @@ class FrameMethod:
         """Initial guesses of the search for the released coordinates."""
         from tkamb.knee.starts import InitialPoses
 
-        return InitialPoses(self.search, self._contact.state.pair, self.cam)
+        return InitialPoses(self.search, self._state.pair, self.cam)
 
     def frame(self, instant: Instant, before: Sequence[FrameStart] = ()) -> Frame:
         """Return loads and contact at an instant.
@@ -308,11 +312,12 @@ class FrameMethod:
         from tkamb.geometry.threads import both
 
         start = before[-1].contact if before else None
-        pose, pair = knee_pose(instant.coordinates), self._contact.state.pair
+        pose, pair = knee_pose(instant.coordinates), self._state.pair
         # The press needs the pose of first touch: it is computed during the body's equations.
         body, _ = both(lambda: self.loads(instant), lambda: pair.touch_at(pose))
         frame = self._pressed(body, pose, start)
         if frame.adjustment and frame.adjustment.restored:
+            # The recorded rotation has other contact points, and therefore another load.
             body = self.loads(instant, frame.adjustment)
             frame = self._pressed(body, pose, frame.start)
         if not self.coupled and self.cam is None:
@@ -335,7 +340,7 @@ class FrameMethod:
         if load <= 0:
             return replace(body, problem="no compressive load")
         began, adjustment = clock.perf_counter(), body.adjustment
-        model, state = self._contact.model, self._contact.state
+        model, state = self._contact.model, self._state
         if adjustment is None:
             result, start = model.press_from(state, load, pose, start)
         else:
@@ -352,7 +357,7 @@ class FrameMethod:
         """Iterate between equations and contact.
 
         The resultants of the contact (if coupled) and the post force act on the body. Each press
-        checks the adjustment of the equations anew.
+        checks the adjustment anew.
 
         Args:
             instant: the knee at one instant.
@@ -372,6 +377,7 @@ class FrameMethod:
             geometry = replace(body.geometry, condyles=body.geometry.condyles | result, post=pushed)
             geometry, loads = instant.solved(geometry)
             body = replace(body, geometry=geometry, loads=loads)
+            # The adjustment of the equations, not the checked one: each press decides anew.
             frame = self._pressed(body, knee_pose(place), frame.start)
             seconds += frame.contact_seconds
             change = abs(float(body.loads.contact_force[1] - load))
@@ -395,6 +401,7 @@ class FrameMethod:
         """
         began = clock.perf_counter()
         good = [each for each in before if each.equilibrium][-3:]
+        # With a held coordinate, residual forces act between both condyles, loaded or not.
         points: dict[str, Array] = {}
         if len(self.search.released) < 5:
             points = self.knee._nearest_points(instant.coordinates)
@@ -434,7 +441,7 @@ class FrameMethod:
         from tkamb.contact.pressing import within_insert
         from tkamb.geometry.threads import both
 
-        pose, model, state = knee_pose(knee.coordinates), self._contact.model, self._contact.state
+        pose, model, state = knee_pose(knee.coordinates), self._contact.model, self._state
         # `within_insert` needs the pose of first touch: it is computed at the same time.
         (result, next_start), _ = both(
             lambda: model.evaluate_from(state, pose, start), lambda: state.pair.touch_at(pose)
@@ -491,7 +498,7 @@ class FrameMethod:
         if result.status is not ContactStatus.OK:
             reason = f"contact {result.status.value.replace('_', ' ')}"
             return replace(frame, problem="; ".join((reason, *result.flags)))
-        state = self._contact.state
+        state = self._state
         return replace(
             frame,
             contact=result,

@@ -66,7 +66,7 @@ def frame_row(
     for side, slip in slips.items():
         row |= _slip_row(case, k, side, slip, frame.geometry.condyles.get(side))
     if frame.pressed:
-        row |= _contact_row(frame, case.scene.yield_stress_MPa * MEGAPASCAL)
+        row |= _contact_row(frame, case.yield_stress)
         row |= _pose_row(frame)
         row["medial_force_per_adduction_N_per_deg"] = frame.sensitivity * DEGREE
         row["split_determined"] = split_determined(frame)
