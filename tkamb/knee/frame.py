@@ -184,6 +184,7 @@ class FrameMethod:
 
     def of(self, knee: "Knee") -> "FrameMethod":
         """Return the same method for another knee."""
+        # The prepared cam belongs to the contact model of this knee.
         return replace(self, knee=knee, ready_cam=None)
 
     def prepare(self) -> None:
@@ -400,6 +401,7 @@ class FrameMethod:
         The initial guess extrapolates the last three equilibria of `before`.
         """
         began = clock.perf_counter()
+        # A frame that failed has no equilibrium: the guess skips it.
         good = [each for each in before if each.equilibrium][-3:]
         # With a held coordinate, residual forces act between both condyles, loaded or not.
         points: dict[str, Array] = {}
@@ -496,6 +498,7 @@ class FrameMethod:
         from tkamb.contact.result import ContactStatus, medial_points
 
         if result.status is not ContactStatus.OK:
+            # The flags of the model say why it failed.
             reason = f"contact {result.status.value.replace('_', ' ')}"
             return replace(frame, problem="; ".join((reason, *result.flags)))
         state = self._state
