@@ -280,7 +280,9 @@ class LiveKnee:
         return folder / "scene.toml"
 
     def _still_case(self, request: BenchRequest) -> Case:
-        height = self._recording(request).state.pair.first_touch_height
+        contact = self._recording(request).knee.contact
+        assert contact is not None  # a case on the bench has contact
+        height = contact.state.pair.first_touch_height
         return self.bench.case_of(request, height, self._case_with(request.thickness_mm))
 
     def _case_with(self, thickness_mm: float | None) -> Case:
