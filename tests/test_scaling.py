@@ -41,8 +41,8 @@ def test_every_part_of_the_case_is_scaled_by_its_power():
     for original, scaled in zip(plain.ligaments, large.ligaments, strict=True):
         assert scaled.slack_length == pytest.approx(S * original.slack_length)
         # The same strain gives S² times the force.
-        assert scaled.stiffness * scaled.slack_length == pytest.approx(
-            S**2 * original.stiffness * original.slack_length
+        assert scaled.law.stiffness * scaled.slack_length == pytest.approx(
+            S**2 * original.law.stiffness * original.slack_length
         )
     for link in ("tibia", "femur"):
         (mass, centre, inertia), (large_mass, large_centre, large_inertia) = (
