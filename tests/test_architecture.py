@@ -77,7 +77,7 @@ def test_there_are_no_other_folders_and_modules():
 
 
 def test_imported_modules_are_found():
-    names = imported(PACKAGE / "run" / "mechanics.py")
+    names = imported(PACKAGE / "run" / "recording.py")
     assert "tkamb.knee.instant" in names
     assert part_of("tkamb.knee.instant") == "knee"
     assert "tkamb.contact.hertz" in imported(PACKAGE / "contact" / "registry.py")
