@@ -3,6 +3,7 @@
 import json
 import shutil
 import zipfile
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -320,9 +321,9 @@ def hashes(scene):
 
 
 @pytest.mark.parametrize("kind", INPUTS)
-def test_compare_names_the_input_of_which_one_byte_differs(run, every_kind, tmp_path, kind):
-    before, path = hashes(every_kind), every_kind.parent / INPUTS[kind]
-    content = path.read_bytes()
+def test_compare_names_the_input_of_which_one_byte_differs(finished, every_kind, monkeypatch, kind):
+    path = every_kind.parent / INPUTS[kind]
+    content, before = path.read_bytes(), hashes(every_kind)
     try:
         path.write_bytes(
             bytes([content[0] ^ 1]) + content[1:] if kind == "mesh" else content + b" "
@@ -330,12 +331,13 @@ def test_compare_names_the_input_of_which_one_byte_differs(run, every_kind, tmp_
         after = hashes(every_kind)
     finally:
         path.write_bytes(content)
-    shutil.copytree(run[1], tmp_path / "b")
-    for out, inputs in ((run[1], before), (tmp_path / "b", after)):
-        results = read_results(out, check=False)
-        results.summary["inputs"] = inputs
-        write_results(results, out)
-    (note,) = compare_folders([run[1], tmp_path / "b"]).notes
+    stored = read_results(finished / "out", check=False)
+    runs = {
+        name: replace(stored, summary=stored.summary | {"inputs": inputs})
+        for name, inputs in (("a", before), ("b", after))
+    }
+    monkeypatch.setattr("tkamb.show.comparison.read_results", lambda path: runs[path.name])
+    (note,) = compare_folders(["a", "b"]).notes
     assert f"differ in the input file {INPUTS[kind]}. " in note
 
 
