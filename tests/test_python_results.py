@@ -95,7 +95,7 @@ def test_titles_legends_and_plots_do_not_overlap():
     measured = {
         f"measured_{name}_N": RUN["force_total_N"] for name in ("total", "medial", "lateral")
     }
-    figure = type(RUN)(RUN.columns | measured, RUN.summary).plot()
+    figure = tkamb.plot(type(RUN)(RUN.columns | measured, RUN.summary))
     figure.draw_without_rendering()
     boxes = [
         part.get_window_extent()
