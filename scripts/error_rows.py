@@ -12,6 +12,7 @@ from typing import Any
 
 from error_cases import ErrorCase, error_cases
 from tkamb.contact.flags import TOO_NARROW
+from tkamb.contact.materials import material as named
 from tkamb.contact.registry import contact_class, contact_model
 from tkamb.errors import InputError
 from tkamb.studies.measures import Quantities, errors, quantities
@@ -63,6 +64,9 @@ class ErrorRow:
         errors: relative errors of approach, mean and peak pressure and area; empty if the press
             failed.
         uncertainty: relative uncertainties of the reference.
+        thickness_over_radius: thickness of the insert over the radius of contact, by the lattice at
+            1 mm.
+        poisson_ratio: of the insert.
     """
 
     case: str
@@ -74,6 +78,8 @@ class ErrorRow:
     status: str
     errors: dict[str, float]
     uncertainty: dict[str, float]
+    thickness_over_radius: float
+    poisson_ratio: float
 
 
 def settings() -> Iterator[tuple[str, str, float]]:
@@ -93,7 +99,10 @@ def solve(case: ErrorCase, material: str, contact: str, resolution_mm: float) ->
     keeps = "cache" in getattr(contact_class(contact), "__dataclass_fields__", {})
     model = contact_model(contact, resolution_mm, **({"cache": False} if keeps else {}))
     result = model.press(model.prepare(case.pair(material)), case.load, case.pose)
-    return {"status": result.status.value, "flags": list(result.flags), **quantities(result)}
+    condyle = result.medial
+    ratio = None if condyle is None else condyle.thickness_over_radius
+    answer = {"status": result.status.value, "flags": list(result.flags), **quantities(result)}
+    return answer | {"thickness_over_radius": ratio}
 
 
 def error_rows(solved: Mapping[str, Mapping[str, Any]]) -> list[ErrorRow]:
@@ -116,12 +125,14 @@ def error_rows(solved: Mapping[str, Mapping[str, Any]]) -> list[ErrorRow]:
             reference = _quantities(fine)
             change = errors(_quantities(coarse), reference)
             uncertainty = {name: round(change[name] / 2, 5) for name in COMPARED}
+            seen = solved[solved_key(case, "polyethylene", "lattice", 1.0)]
+            ratio = round(float(seen["thickness_over_radius"]), 4)
             for name, sizes in models.items():
                 for mm in sizes:
                     answer = solved.get(solved_key(case, material, name, mm))
                     if answer is not None:
                         result.append(
-                            _row(case, material, name, mm, answer, reference, uncertainty)
+                            _row(case, material, name, mm, answer, reference, uncertainty, ratio)
                         )
     return result
 
@@ -134,6 +145,7 @@ def _row(
     answer: Mapping[str, Any],
     reference: Quantities,
     uncertainty: dict[str, float],
+    ratio: float,
 ) -> ErrorRow:
     status = str(answer["status"])
     if any(TOO_NARROW in flag for flag in answer.get("flags", ())):
@@ -144,12 +156,15 @@ def _row(
         apart = {name: round(whole[name], 5) for name in COMPARED}
     return ErrorRow(
         case.name, case.situation, case.held_out, material, contact, resolution_mm, status, apart,
-        uncertainty,
+        uncertainty, ratio, named(material).poisson_ratio,
     )  # fmt: skip
 
 
 def _quantities(answer: Mapping[str, Any]) -> Quantities:
-    return {k: v for k, v in answer.items() if k not in ("status", "flags", "sumF")}
+    return {k: v for k, v in answer.items() if k not in _BESIDE}
+
+
+_BESIDE = ("status", "flags", "sumF", "thickness_over_radius")
 
 
 def rows_json(rows: list[ErrorRow]) -> str:

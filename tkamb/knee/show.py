@@ -10,7 +10,6 @@ import pinocchio as pin
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, Array, mirrored_pose, transform
-from tkamb.knee.parts import mirrored_surface
 
 if TYPE_CHECKING:
     from tkamb.contact.result import ContactResult
@@ -139,7 +138,7 @@ def _solid(
 ) -> None:
     if surface is None:
         return
-    mesh = mirrored_surface(surface) if is_left else surface
+    mesh = surface.mirrored() if is_left else surface
     material = geometry.MeshPhongMaterial(
         color=COLOURS[part], opacity=opacity, transparent=opacity < 1.0
     )
