@@ -12,9 +12,12 @@ from typing import Any
 
 from error_cases import ErrorCase, error_cases
 from tkamb.contact.flags import TOO_NARROW
-from tkamb.contact.materials import material as named
+from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_class, contact_model
 from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+from tkamb.show.tradeoff_report import bodies_of
+from tkamb.studies.cases import study_case
 from tkamb.studies.measures import Quantities, errors, quantities
 
 
@@ -45,6 +48,8 @@ SETTINGS: dict[str, dict[str, tuple[float, ...]]] = {
     },
 }
 """Material -> contact model -> measured resolutions, mm."""
+RATIOS = Path(__file__).parent / "data" / "known_error_ratios.json"
+"""Result of `ratios`."""
 COMPARED = ("approach", "mean_pressure", "peak_pressure", "area")
 
 
@@ -64,9 +69,6 @@ class ErrorRow:
         errors: relative errors of approach, mean and peak pressure and area; empty if the press
             failed.
         uncertainty: relative uncertainties of the reference.
-        thickness_over_radius: thickness of the insert over the radius of contact, by the lattice at
-            1 mm.
-        poisson_ratio: of the insert.
     """
 
     case: str
@@ -78,8 +80,6 @@ class ErrorRow:
     status: str
     errors: dict[str, float]
     uncertainty: dict[str, float]
-    thickness_over_radius: float
-    poisson_ratio: float
 
 
 def settings() -> Iterator[tuple[str, str, float]]:
@@ -97,12 +97,11 @@ def solved_key(case: ErrorCase, material: str, contact: str, resolution_mm: floa
 def solve(case: ErrorCase, material: str, contact: str, resolution_mm: float) -> dict[str, Any]:
     """Return status, flags and quantities of a press."""
     keeps = "cache" in getattr(contact_class(contact), "__dataclass_fields__", {})
-    model = contact_model(contact, resolution_mm, **({"cache": False} if keeps else {}))
+    model = contact_model(
+        contact, resolution=resolution_mm * 1e-3, **({"cache": False} if keeps else {})
+    )
     result = model.press(model.prepare(case.pair(material)), case.load, case.pose)
-    condyle = result.medial
-    ratio = None if condyle is None else condyle.thickness_over_radius
-    answer = {"status": result.status.value, "flags": list(result.flags), **quantities(result)}
-    return answer | {"thickness_over_radius": ratio}
+    return {"status": result.status.value, "flags": list(result.flags), **quantities(result)}
 
 
 def error_rows(solved: Mapping[str, Mapping[str, Any]]) -> list[ErrorRow]:
@@ -125,14 +124,12 @@ def error_rows(solved: Mapping[str, Mapping[str, Any]]) -> list[ErrorRow]:
             reference = _quantities(fine)
             change = errors(_quantities(coarse), reference)
             uncertainty = {name: round(change[name] / 2, 5) for name in COMPARED}
-            seen = solved[solved_key(case, "polyethylene", "lattice", 1.0)]
-            ratio = round(float(seen["thickness_over_radius"]), 4)
             for name, sizes in models.items():
                 for mm in sizes:
                     answer = solved.get(solved_key(case, material, name, mm))
                     if answer is not None:
                         result.append(
-                            _row(case, material, name, mm, answer, reference, uncertainty, ratio)
+                            _row(case, material, name, mm, answer, reference, uncertainty)
                         )
     return result
 
@@ -145,7 +142,6 @@ def _row(
     answer: Mapping[str, Any],
     reference: Quantities,
     uncertainty: dict[str, float],
-    ratio: float,
 ) -> ErrorRow:
     status = str(answer["status"])
     if any(TOO_NARROW in flag for flag in answer.get("flags", ())):
@@ -156,15 +152,34 @@ def _row(
         apart = {name: round(whole[name], 5) for name in COMPARED}
     return ErrorRow(
         case.name, case.situation, case.held_out, material, contact, resolution_mm, status, apart,
-        uncertainty, ratio, named(material).poisson_ratio,
+        uncertainty,
     )  # fmt: skip
 
 
 def _quantities(answer: Mapping[str, Any]) -> Quantities:
-    return {k: v for k, v in answer.items() if k not in _BESIDE}
+    return {k: v for k, v in answer.items() if k not in ("status", "flags", "sumF")}
 
 
-_BESIDE = ("status", "flags", "sumF", "thickness_over_radius")
+def ratios() -> dict[str, list[float]]:
+    """Return pair of bodies -> insert's thickness over the radius of contact, of each condyle.
+
+    The contacts are those of the lattice at 1 mm. The cases are the pairs and the study's cases.
+    """
+    model = contact_model("lattice", 1.0, cache=False)
+    found = {}
+    for name, case in _every_case():
+        result = model.press(model.prepare(case[0]), *case[1:])
+        sides = [one for one in (result.medial, result.lateral) if one is not None]
+        found[name] = [round(one.thickness_over_radius, 4) for one in sides]
+    return found
+
+
+def _every_case() -> Iterator[tuple[str, tuple[ContactPair, float, Array]]]:
+    for case in error_cases():
+        yield case.name, (case.pair(), case.load, case.pose)
+    for name in ("sphere", "two condyles", "conforming", "knee 60 deg"):
+        study = study_case(name)
+        yield bodies_of(name), (study.pair, study.load, study.pose)
 
 
 def rows_json(rows: list[ErrorRow]) -> str:

@@ -93,3 +93,24 @@ def stated_table(entries: Sequence[Mapping[str, Any]]) -> list[str]:
         cells += [str(entry["pairs"]), str(entry["cases"]), *shares, *spans, covered]
         lines.append(f"| {' | '.join(cells)} |")
     return lines
+
+
+def other_table(kept: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return the table of geometries outside the measured pairs.
+
+    Args:
+        kept: content of scripts/data/other_geometries.json.
+    """
+    names = ("approach", "force", "mean_pressure", "peak_pressure", "area")
+    heads = " | ".join(f"{({'force': 'condyle force'} | HEADS)[name]} %" for name in names)
+    lines = [
+        f"| geometry | contact, 1 mm | {heads} | stated error | reason |",
+        "| --- | --- |" + " ---: |" * len(names) + " --- | --- |",
+    ]
+    for entry in kept.values():
+        for row in entry["rows"]:
+            found = row.get("errors", {})
+            shares = [f"{100 * found[name]:.2g}" if name in found else "–" for name in names]
+            cells = [row["geometry"], row["contact"], *shares, row["verdict"], row["why"]]
+            lines.append(f"| {' | '.join(cells)} |")
+    return lines

@@ -6,7 +6,8 @@ from statistics import median
 from typing import Any
 
 from error_cases import SITUATIONS
-from error_rows import ErrorRow
+from error_rows import RATIOS, ErrorRow
+from tkamb.contact.materials import material as named
 from tkamb.errors import InputError
 from tkamb.run.known_errors import KnownError
 from tkamb.show.tradeoff_report import (
@@ -148,13 +149,15 @@ def _known_error(
     worst: dict[str, float | None] = {name: _worst(name, errors, widened) for name in names}
     if worst["force"] is not None:
         worst["force"] = max(worst["force"], round(SPLIT * (worst["approach"] or 0.0), 6))
-    situations = {}
-    for place in SITUATIONS:
-        some = [row.errors for row in stated if row.situation == place]
-        if some:
-            factor = 1.0 + WIDENING / len(some)
-            limit = {n: _worst(n, some, factor) for n in names if n != "force"}
-            situations[place] = {n: min(v, worst[n]) for n, v in limit.items()}
+    situations = {
+        place: {
+            name: min(_worst(name, some, 1.0 + WIDENING / len(some)), limit)
+            for name, limit in worst.items()
+            if name != "force" and limit is not None
+        }
+        for place in SITUATIONS
+        if (some := [row.errors for row in stated if row.situation == place])
+    }
     judged = [
         row.errors[name] <= limit
         for row in own
@@ -165,15 +168,18 @@ def _known_error(
     covered = sum(judged) / len(judged) if judged else None
     label, resolution, material = key
     said = {"contact": label, "resolution_mm": resolution, "material": material}
-    ranges = {
-        name: [min(values), max(values)]
-        for name in ("thickness_over_radius", "poisson_ratio")
-        if (values := [getattr(row, name) for row in own])
-    }
     return said | worst | {
         "cases": len(errors), "situations": situations, "covered": covered,
-        "pairs": pairs, "range": ranges,
+        "pairs": pairs, "range": _range({*bodies, *(row.case for row in own)}, material),
     }  # fmt: skip
+
+
+def _range(bodies: set[str], material: str) -> dict[str, list[float]]:
+    """Return the range of pairs of bodies; see `KnownError`."""
+    measured = json.loads(RATIOS.read_text(encoding="utf-8"))
+    ratios = [ratio for name in bodies for ratio in measured[name]]
+    nu = named(material).poisson_ratio
+    return {"thickness_over_radius": [min(ratios), max(ratios)], "poisson_ratio": [nu, nu]}
 
 
 def _worst(name: str, errors: Sequence[Mapping[str, float]], factor: float) -> Any:

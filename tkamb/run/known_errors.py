@@ -66,7 +66,8 @@ class KnownError:
         pairs: number of pairs of bodies.
         range: quantity -> smallest and largest value on these pairs: "thickness_over_radius",
             thickness of the insert over the radius of the circle with the contact's area, and
-            "poisson_ratio". All inserts stand on the whole of their bottoms.
+            "poisson_ratio". All inserts stand on the whole of their bottoms; the foundations and
+            `hertz` flag others.
     """
 
     approach: float
@@ -264,8 +265,9 @@ def known_error_words(error: Mapping[str, Any] | str, names: Iterable[str]) -> s
     if isinstance(error, str):
         return f"The error of this setting of the contact model is {error}."
     names = list(names)
+    widened = f", widened for {error['pairs']} pairs of bodies," if error.get("pairs") else ""
     words = (
-        f"In {error['cases']} reference cases the error of the contact model was at most "
+        f"In {error['cases']} reference cases the error of the contact model{widened} was at most "
         f"{_listed(error, names)}."
     )
     stated = [name for name in names if name in ("peak_pressure", "area")]
