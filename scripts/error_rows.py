@@ -165,7 +165,7 @@ def ratios() -> dict[str, list[float]]:
 
     The contacts are those of the lattice at 1 mm. The cases are the pairs and the study's cases.
     """
-    model = contact_model("lattice", 1.0, cache=False)
+    model = contact_model("lattice", resolution=1e-3, cache=False)
     found = {}
     for name, case in _every_case():
         result = model.press(model.prepare(case[0]), *case[1:])

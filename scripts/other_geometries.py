@@ -167,5 +167,5 @@ def verdict(
 
 def _pressed(geometry: Geometry, model: str, spacing_mm: float) -> Any:
     keeps = {"cache": False} if model in ("fe", "lattice") else {}
-    contact = contact_model(model, spacing_mm, **keeps)
+    contact = contact_model(model, resolution=spacing_mm * MILLIMETRE, **keeps)
     return contact.press(contact.prepare(geometry.pair()), geometry.load, geometry.pose)

@@ -86,7 +86,7 @@ def test_contact_is_similar_so_that_pairs_scale_with_the_cells(model):
         box = box_insert(8e-3, 4e-3, 8e-3)
         insert = Surface(scale * box.vertices, box.faces)
         pair = ContactPair(femoral, insert, material("polyethylene"))
-        contact = contact_model(model, scale)
+        contact = contact_model(model, resolution=scale * 1e-3)
         pose = above()
         pose[:3, 3] *= scale
         results.append(contact.press(contact.prepare(pair), 300.0 * scale**2, pose))
@@ -110,7 +110,7 @@ def test_the_stated_error_covers_the_approach_on_coarse_facets():
     ball = trimesh.creation.uv_sphere(radius=22e-3, count=[18, 36])
     surface = Surface(np.asarray(ball.vertices), np.asarray(ball.faces), "ball")
     pair = ContactPair(surface, box_insert(14e-3, 8e-3, 14e-3), material("polyethylene"))
-    model = contact_model("lattice", 1.0, cache=False)
+    model = contact_model("lattice", resolution=1e-3, cache=False)
     result = model.press(model.prepare(pair), 1000.0, above())
     error = stated(ContactSituation.of(result))
     assert 0.2 < abs(result.approach / 0.324e-3 - 1.0) < error.approach < 0.6

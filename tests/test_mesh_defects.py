@@ -27,7 +27,7 @@ MODELS = ("foundation", "foundation-linear", "hertz", "lattice-linear")
 
 def flags(femoral, insert, model="foundation", load=1000.0):
     """Return the flags of a press as one text."""
-    contact = contact_model(model, 1.5)
+    contact = contact_model(model, resolution=1.5e-3)
     pair = ContactPair(femoral, insert, material("polyethylene"))
     return "; ".join(contact.press(contact.prepare(pair), load, above()).flags)
 
@@ -110,7 +110,9 @@ def test_defects_are_found_once_and_move_with_the_mesh(monkeypatch):
 
 
 def test_wear_names_the_defect_of_its_insert():
-    engine = ContactEngine(contact_model("foundation", 1.5), FEMORAL, material("polyethylene"))
+    engine = ContactEngine(
+        contact_model("foundation", resolution=1.5e-3), FEMORAL, material("polyethylene")
+    )
     motion = CycleMotion(np.stack([above()] * 2), np.array([800.0, 800.0]), 1.0)
     maps = engine.maps(spiked(INSERT, [0.0, 7e-3, 10e-3], 0.5e-3), motion)
     assert sorted(maps.flagged) == [0, 1] and "a spike" in maps.flagged[0]

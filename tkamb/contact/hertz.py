@@ -169,7 +169,7 @@ class Hertz(ContactModel):
     ) -> ContactResult:
         """Return the contact at a pose; see `ContactModel`."""
         if not np.isfinite(pose).all():
-            return ContactResult.failed(state, pose, "the pose is not finite")
+            return ContactResult.out_of_range(state, pose, "the pose is not finite")
         samples, material = state.surface, state.pair.material
         # The femoral component is rigid, so only the insert's compliance counts.
         plane_modulus = material.young_modulus / (1 - material.poisson_ratio**2)
@@ -181,7 +181,9 @@ class Hertz(ContactModel):
                 continue
             if geometry.contact is None:
                 if pose[1, 3] < geometry.height:
-                    return ContactResult.failed(state, pose, f"{SIDES[side]} condyle {CONFORMING}")
+                    return ContactResult.out_of_range(
+                        state, pose, f"{SIDES[side]} condyle {CONFORMING}"
+                    )
                 continue
             depth = indentation(geometry, pose)
             if depth <= 0:
@@ -191,7 +193,7 @@ class Hertz(ContactModel):
             patch = contact_ellipse(flat, steep, depth, plane_modulus)
             pressure[side], share = map_pressure(samples, geometry.contact, patch)
             if share < HERTZ.least_share_on_insert:
-                return ContactResult.failed(
+                return ContactResult.out_of_range(
                     state, pose, f"{SIDES[side]} contact ellipse leaves the insert"
                 )
             described = patches[side] = _described(samples, geometry.contact, patch)
