@@ -12,7 +12,6 @@ import pinocchio as pin
 
 import tkamb
 from tkamb.knee.canonical import mirrored_spatial
-from tkamb.knee.parts import mirrored_surface
 from tkamb.units import STANDARD_GRAVITY
 
 MIRROR = np.diag([1.0, 1.0, -1.0])
@@ -166,7 +165,7 @@ def other_knee(plain, model, left, plane):
     """Return the same knee on another model, with meshes as trimesh objects or arrays."""
     surfaces = [plain.femoral, plain.insert, plain.button]
     if left:
-        surfaces = [mirrored_surface(item) for item in surfaces]
+        surfaces = [item.mirrored() for item in surfaces]
     femoral, insert, button = ((item.vertices, item.faces) for item in surfaces)
     bundles = [
         replace(item, proximal=moved(item.proximal, left), distal=moved(item.distal, left))

@@ -316,6 +316,9 @@ def worn(pressure_scale, wear_scale=1.0):
     for side in ("medial", "lateral"):
         name = f"{side}_peak_pressure_MPa"
         columns[name] = columns[name] * pressure_scale
+        columns[f"{side}_thickness_mm"] = np.full(11, 8.0)
+        columns[f"{side}_area_mm2"] = np.full(11, 60.0)
+    columns["approach_mm"] = np.full(11, 0.1)
     wear = {
         f"volume_mm3_per_Mc{end}": wear_scale * v
         for end, v in (("", 8.0), ("_low", 4.0), ("_high", 16.0))
@@ -357,11 +360,11 @@ def two_by_two(tmp_path):
 
 def test_the_figure_of_designs_has_factors_on_axis_and_legend(two_by_two):
     outcomes = {run.number: worn(1.0 + 0.1 * run.number, 2.0) for run in two_by_two.runs}
-    bars = design_bars(two_by_two, groups_of(two_by_two, outcomes))
+    bars = design_bars(two_by_two, groups_of(two_by_two, outcomes), outcomes)
     assert [(bar.place, bar.series) for bar in bars["pressure"]] == [
         (f"thickness {t} mm", f"conformity {c}") for c in ("0.4", "0.8") for t in (6, 10)
     ]
-    error = run_error(two_by_two.runs[0]).peak_pressure
+    error = run_error(two_by_two.runs[0], outcomes[0]).peak_pressure
     first = bars["pressure"][0]
     peaks = [
         max(

@@ -9,7 +9,6 @@ import pytest
 import tkamb
 from knee_bodies import MIRROR, mirrored_inertia, mirrored_se3
 from test_knee import FOUNDATION, SCENE, at
-from tkamb.knee.parts import mirrored_surface
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +34,7 @@ def without_patella(plain, left=False):
         model.addFrame(pin.Frame(name, joint, 0, placement, pin.FrameType.BODY))
     surfaces = [plain.femoral, plain.insert, plain.button]
     if left:
-        surfaces = [mirrored_surface(one) for one in surfaces]
+        surfaces = [one.mirrored() for one in surfaces]
 
     def moved(point):
         return (point.link, tuple(MIRROR @ point.position if left else point.position))

@@ -1,5 +1,7 @@
 """Defects of meshes, unsupported bottoms and spaces of files reach the result of every model."""
 
+import pickle
+
 import numpy as np
 import pytest
 import trimesh
@@ -10,8 +12,12 @@ from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
 from tkamb.errors import InputError
+from tkamb.geometry import defects
+from tkamb.geometry.frames import pose
 from tkamb.geometry.surface import Surface
 from tkamb.io.recordings.meshes import check_same_space, load_surface, space_of
+from tkamb.studies.wear.engine import ContactEngine
+from tkamb.studies.wear.motion import CycleMotion
 
 FEMORAL = condyles(subdivisions=4)
 INSERT = dished_insert(cells=24)
@@ -57,6 +63,7 @@ def test_an_opening_in_the_contact_is_named_by_every_model(model):
     ("femoral", "insert", "words"),
     [
         (spiked(FEMORAL, TIP, -0.5e-3), INSERT, "femoral mesh, a spike of 0.5 mm"),
+        (spiked(FEMORAL, TIP, -0.1e-3), INSERT, "femoral mesh, a spike of 0.1 mm"),
         (noisy(FEMORAL, 3e-5), INSERT, "femoral mesh, noise"),
         (FEMORAL, spiked(INSERT, [0.0, 7e-3, 10e-3], 0.5e-3), "insert mesh, a spike"),
         (FEMORAL, noisy(INSERT, 3e-5), "insert mesh, noise"),
@@ -79,6 +86,36 @@ def test_a_defect_in_the_contact_is_named(femoral, insert, words):
 )
 def test_a_defect_away_from_the_contact_is_not_flagged(femoral):
     assert "defect" not in flags(femoral, INSERT)
+
+
+def test_the_pole_of_an_open_cap_is_no_opening():
+    """The surface lies within the edge of the cap, so that nothing is missing there."""
+    cap = opened(FEMORAL, np.array([0.0, 20e-3, 10e-3]), 36e-3)
+    cap = opened(cap, np.array([0.0, 20e-3, -10e-3]), 36e-3)
+    assert any(defect.kind == "opening" for defect in cap.defects)
+    assert "opening" not in flags(cap, INSERT)
+
+
+def test_defects_are_found_once_and_move_with_the_mesh(monkeypatch):
+    spiky, calls = spiked(FEMORAL, TIP, -0.5e-3), []
+    find = defects.defects_of
+    monkeypatch.setattr(defects, "defects_of", lambda one: calls.append(one) or find(one))
+    there = pose(np.eye(3), [1e-3, 2e-3, 3e-3])
+    moved, *_ = spiky.moved(there).mirrored().defects
+    worn = spiky.remade(spiky.vertices - [0.0, 1e-5, 0.0], spiky.faces)
+    again = pickle.loads(pickle.dumps(worn.moved(there)))
+    assert np.allclose(moved.places[0], (spiky.defects[0].places[0] + there[:3, 3]) * [1, 1, -1])
+    assert worn.defects[0].words == again.defects[0].words == moved.words
+    assert len(calls) == 2  # the pickled one had not been asked before
+
+
+def test_wear_names_the_defect_of_its_insert():
+    engine = ContactEngine(
+        contact_model("foundation", resolution=1.5e-3), FEMORAL, material("polyethylene")
+    )
+    motion = CycleMotion(np.stack([above()] * 2), np.array([800.0, 800.0]), 1.0)
+    maps = engine.maps(spiked(INSERT, [0.0, 7e-3, 10e-3], 0.5e-3), motion)
+    assert sorted(maps.flagged) == [0, 1] and "a spike" in maps.flagged[0]
 
 
 def test_steps_of_voxels_are_named_instead_of_finer_cells():

@@ -21,7 +21,6 @@ from tkamb.io.recordings.meshes import (
     BONE_SIZE,
     axes_rotation,
     load_surface,
-    mirrored,
     read_triangles,
 )
 
@@ -91,10 +90,10 @@ def test_axes_turn_the_mesh(tmp_path):
 
 def test_a_surface_mirrored_twice_is_unchanged_and_outward():
     ball = sphere(0.02, 2, (0.0, 0.01, 0.03))
-    once = mirrored(ball)
+    once = ball.mirrored()
     assert once.vertices[:, 2].mean() == pytest.approx(-0.03)
     assert once.mesh.volume == pytest.approx(ball.mesh.volume)
-    assert np.array_equal(mirrored(once).vertices, ball.vertices)
+    assert np.array_equal(once.mirrored().vertices, ball.vertices)
 
 
 def test_a_wrong_unit_is_refused_with_the_correct_one(tmp_path):

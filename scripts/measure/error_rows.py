@@ -12,8 +12,12 @@ from typing import Any
 
 from error_cases import ErrorCase, error_cases
 from tkamb.contact.flags import TOO_NARROW
+from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_class, contact_model
 from tkamb.errors import InputError
+from tkamb.geometry.frames import Array
+from tkamb.show.tradeoff_report import bodies_of
+from tkamb.studies.cases import study_case
 from tkamb.studies.measures import Quantities, errors, quantities
 
 
@@ -44,6 +48,8 @@ SETTINGS: dict[str, dict[str, tuple[float, ...]]] = {
     },
 }
 """Material -> contact model -> measured resolutions, mm."""
+RATIOS = Path(__file__).parent / "data" / "known_error_ratios.json"
+"""Result of `ratios`."""
 COMPARED = ("approach", "mean_pressure", "peak_pressure", "area")
 
 
@@ -152,6 +158,28 @@ def _row(
 
 def _quantities(answer: Mapping[str, Any]) -> Quantities:
     return {k: v for k, v in answer.items() if k not in ("status", "flags", "sumF")}
+
+
+def ratios() -> dict[str, list[float]]:
+    """Return pair of bodies -> insert's thickness over the radius of contact, of each condyle.
+
+    The contacts are those of the lattice at 1 mm. The cases are the pairs and the study's cases.
+    """
+    model = contact_model("lattice", resolution=1e-3, cache=False)
+    found = {}
+    for name, case in _every_case():
+        result = model.press(model.prepare(case[0]), *case[1:])
+        sides = [one for one in (result.medial, result.lateral) if one is not None]
+        found[name] = [round(one.thickness_over_radius, 4) for one in sides]
+    return found
+
+
+def _every_case() -> Iterator[tuple[str, tuple[ContactPair, float, Array]]]:
+    for case in error_cases():
+        yield case.name, (case.pair(), case.load, case.pose)
+    for name in ("sphere", "two condyles", "conforming", "knee 60 deg"):
+        study = study_case(name)
+        yield bodies_of(name), (study.pair, study.load, study.pose)
 
 
 def rows_json(rows: list[ErrorRow]) -> str:

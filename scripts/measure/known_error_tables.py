@@ -1,9 +1,12 @@
-"""Tables of docs/known_errors.md, from scripts/data/known_error_cases.json."""
+"""Tables of docs/known_errors.md: errors on the pairs of bodies, and the stated errors."""
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from error_cases import SITUATIONS
 from error_rows import COMPARED, ErrorRow
+from tkamb.run.known_errors import KNOWN_ERROR, STORED
 
 HEADS = {
     "approach": "approach",
@@ -57,3 +60,57 @@ def _worst(rows: Sequence[ErrorRow]) -> list[str]:
     if not rows:
         return ["–"] * len(COMPARED)
     return [f"{100 * max(row.errors[name] for row in rows):.2g}" for name in COMPARED]
+
+
+def stated_entries() -> list[dict[str, Any]]:
+    """Return the content of `tkamb/run/known_errors.json`."""
+    entries: list[dict[str, Any]] = json.loads(STORED.read_text(encoding="utf-8"))
+    return entries
+
+
+def stated_table(entries: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the table of the errors that presses and runs state.
+
+    Args:
+        entries: content of `tkamb/run/known_errors.json`.
+    """
+    names = ("approach", "force", "mean_pressure", "peak_pressure", "area")
+    heads = " | ".join(f"{({'force': 'condyle force'} | HEADS)[name]} %" for name in names)
+    lines = [
+        f"| material | contact | mm | pairs | cases | {heads} | thickness/radius | nu | covered |",
+        "| --- | --- | ---: |" + " ---: |" * (len(names) + 5),
+    ]
+    for entry in entries:
+        few = entry["pairs"] < KNOWN_ERROR.least_pairs or not entry["range"]
+        shares = ["–" if few or entry[n] is None else f"{100 * entry[n]:.2g}" for n in names]
+        ends = [entry["range"].get(n) for n in ("thickness_over_radius", "poisson_ratio")]
+        spans = [
+            " to ".join(dict.fromkeys(f"{value:.3g}" for value in span)) if span else "–"
+            for span in ends
+        ]
+        covered = "–" if entry["covered"] is None else f"{100 * entry['covered']:.0f} %"
+        cells = [entry["material"], entry["contact"], f"{entry['resolution_mm']:g}"]
+        cells += [str(entry["pairs"]), str(entry["cases"]), *shares, *spans, covered]
+        lines.append(f"| {' | '.join(cells)} |")
+    return lines
+
+
+def other_table(kept: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return the table of geometries outside the measured pairs.
+
+    Args:
+        kept: content of scripts/data/other_geometries.json.
+    """
+    names = ("approach", "force", "mean_pressure", "peak_pressure", "area")
+    heads = " | ".join(f"{({'force': 'condyle force'} | HEADS)[name]} %" for name in names)
+    lines = [
+        f"| geometry | contact, 1 mm | {heads} | stated error | reason |",
+        "| --- | --- |" + " ---: |" * len(names) + " --- | --- |",
+    ]
+    for entry in kept.values():
+        for row in entry["rows"]:
+            found = row.get("errors", {})
+            shares = [f"{100 * found[name]:.2g}" if name in found else "–" for name in names]
+            cells = [row["geometry"], row["contact"], *shares, row["verdict"], row["why"]]
+            lines.append(f"| {' | '.join(cells)} |")
+    return lines

@@ -7,13 +7,13 @@ A map does not resolve the rounding of a real edge, which also wears and chips. 
 contact at the edge states the place of the peak.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from tkamb.geometry.defects import Defect
+from tkamb.geometry.defects import Defect, defect_words
 from tkamb.geometry.frames import Array, Index, Mask, transform
 from tkamb.geometry.surface import Surface
 from tkamb.units import DEGREE, MILLIMETRE
@@ -215,6 +215,11 @@ UNSUPPORTED = "contact lies over an unsupported bottom"
 """Text of the flag after "the <side> "."""
 
 
+def unmeasured_flags(flags: Iterable[str]) -> list[str]:
+    """Return the flags of contacts for which no model's error is known."""
+    return [flag for flag in flags if MESH_DEFECT in flag or UNSUPPORTED in flag]
+
+
 def mesh_flags(
     bodies: Mapping[str, tuple[Surface, Array]], points: Array, area: Array, pressure: Array
 ) -> Iterator[str]:
@@ -233,7 +238,7 @@ def mesh_flags(
     reach = MESH_FLAG.reach_cells * float(np.sqrt(np.median(area[loaded]))) + 0.5 * MILLIMETRE
     contact = cKDTree(points[loaded])
     for name, (surface, pose) in bodies.items():
-        reached: dict[str, list[Defect]] = {}
+        reached: list[Defect] = []
         for defect in surface.defects:
             places = transform(pose, defect.places)
             within = contact.query(places, distance_upper_bound=reach)[0] <= reach
@@ -242,12 +247,11 @@ def mesh_flags(
                 near = contact.query(own, distance_upper_bound=reach)[0] <= reach
                 within &= within.sum() > MESH_FLAG.noisy_share * near.sum()
             if within.any() or (defect.kind == "opening" and _below(places, points, reach)):
-                reached.setdefault(defect.kind, []).append(defect)
-        for found in reached.values():
-            more = f" and {len(found) - 1} more" if len(found) > 1 else ""
+                reached.append(defect)
+        for words in defect_words(reached):
             yield (
-                f"{MESH_DEFECT} {name} mesh, {found[0].words}{more}: pressure, area and approach "
-                "cannot be relied on; mend the mesh"
+                f"{MESH_DEFECT} {name} mesh, {words}: pressure, area and approach cannot be relied "
+                "on; mend the mesh"
             )
 
 

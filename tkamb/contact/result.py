@@ -70,6 +70,11 @@ class CondyleContact:
     centre_of_pressure: Array
     thickness: float
 
+    @property
+    def thickness_over_radius(self) -> float:
+        """1, thickness over the radius of the circle with the contact's area."""
+        return self.thickness / math.sqrt(self.area / math.pi)
+
 
 @dataclass(frozen=True, eq=False)
 class ContactResult:

@@ -5,13 +5,14 @@ difference is far below a contact's approach (about 0.1 mm), whatever the size o
 spike is one vertex far from the quadric of smooth neighbours; noise is a difference everywhere.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from tkamb.geometry.frames import Array, Index
+from tkamb.geometry.frames import Array, Index, transform
 from tkamb.geometry.topology import BoundaryLoop, boundary_loops
 from tkamb.units import MILLIMETRE
 
@@ -27,9 +28,12 @@ class DefectSettings:
 
     neighbours: int = 18
     """Number of nearest vertices for a quadric: three times its six coefficients."""
-    spike: float = 0.2 * MILLIMETRE
-    """m: smallest height of a spike. Chosen above the largest difference of 0.12 mm on the dishes
-    of the insert of a public data set."""
+    spike: float = 0.05 * MILLIMETRE
+    """m: smallest height of a spike whose triangles have all their vertices among the nearest ones.
+    Chosen above the largest difference of 0.03 mm on the dishes of three inserts."""
+    spike_of_fan: float = 0.2 * MILLIMETRE
+    """m: smallest height of another spike. Chosen above the largest difference of 0.12 mm on the
+    dishes of the same inserts; the nearest vertices then lie on one side."""
     least_ring: int = 3
     """Smallest number of nearest vertices that share a triangle with a spike. By definition of a
     tip on a surface."""
@@ -51,6 +55,9 @@ class DefectSettings:
     least_eigenvalue: float = 1e-3
     """1: smallest eigenvalue of the normal equations, at neighbours within the unit disc. With a
     smaller one the quadric is not determined. Not studied."""
+    sheet: float = 0.3
+    """1: mean cosine between a surface beside a loop and the way to the loop's centre, above which
+    the surface lies within the loop. By definition 0 for a tube. Not studied otherwise."""
     cap_spacing: float = 0.5 * MILLIMETRE
     """m: spacing of the points that fill an opening. Chosen below the cells of a map."""
 
@@ -72,6 +79,30 @@ class Defect:
     words: str
     places: Array
 
+    def moved(self, pose_here_in_there: Array) -> "Defect":
+        """Return the defect in another frame, of a pose or a mirror image (4, 4)."""
+        return replace(self, places=transform(pose_here_in_there, self.places))
+
+
+def defect_words(defects: Iterable[Defect]) -> tuple[str, ...]:
+    """Return words for each kind of defect, like "a spike of 0.5 mm and 2 more"."""
+    found: dict[str, list[str]] = {}
+    for defect in defects:
+        found.setdefault(defect.kind, []).append(defect.words)
+    return tuple(
+        words[0] + (f" and {len(words) - 1} more" if len(words) > 1 else "")
+        for words in found.values()
+    )
+
+
+def mesh_words(surface: "Surface") -> tuple[str, ...]:
+    """Return the defects of a whole mesh in words.
+
+    Noise counts if most vertices have it: creases of a smooth part are rough, too.
+    """
+    most = 0.5 * len(np.unique(surface.corner_vertices))
+    return defect_words(d for d in surface.defects if d.kind != "noise" or len(d.places) > most)
+
 
 def defects_of(surface: "Surface") -> tuple[Defect, ...]:
     """Return the defects of a surface."""
@@ -90,7 +121,10 @@ def defects_of(surface: "Surface") -> tuple[Defect, ...]:
     for n in np.flatnonzero(spikes):
         # The tip of a fan of long triangles is no spike: its neighbours are on other surfaces.
         ring = surface.corner_vertices[(surface.corner_vertices == vertices[n]).any(axis=1)]
-        if np.isin(vertices[near[n]], ring).sum() < DEFECT.least_ring:
+        others = np.setdiff1d(ring, vertices[n])
+        count = np.isin(others, vertices[near[n]]).sum()
+        high = abs(height[n]) > DEFECT.spike_of_fan
+        if count < (DEFECT.least_ring if high else len(others)):
             continue
         words = f"a spike of {abs(height[n]) / MILLIMETRE:.2g} mm"
         found.append(Defect("spike", words, points[n : n + 1]))
@@ -110,9 +144,13 @@ def _opening(surface: "Surface", loop: BoundaryLoop) -> Defect:
     """Return an opening, with points on the smooth cap that would close it.
 
     The cap is a paraboloid over the loop's mean plane. Its sagitta is half of the mean height of
-    the loop's tangent planes above the centre.
+    the loop's tangent planes above the centre. If the surface lies within the loop, like a sheet
+    within its edge, no cap is missing, and the points are the edge.
     """
     ring = surface.vertices[loop.vertices]
+    words = f"an opening {loop.width / MILLIMETRE:.2g} mm wide"
+    if _inward(surface, loop) > DEFECT.sheet:
+        return Defect("opening", words, ring)
     normals = _normals(surface)[loop.vertices]
     axis = normals.sum(axis=0)
     axis /= max(float(np.linalg.norm(axis)), 1e-12)
@@ -124,8 +162,20 @@ def _opening(surface: "Surface", loop: BoundaryLoop) -> Defect:
     count = int(np.clip(np.ceil(reach / DEFECT.cap_spacing), 1, 40)) + 1
     share = np.linspace(0.0, 1.0, count)[:, None, None]
     cap = loop.centre + share * (ring - loop.centre) + (1.0 - share**2) * sagitta * axis
-    words = f"an opening {loop.width / MILLIMETRE:.2g} mm wide"
     return Defect("opening", words, cap.reshape(-1, 3))
+
+
+def _inward(surface: "Surface", loop: BoundaryLoop) -> float:
+    """Return the mean cosine between the surface beside a loop and the way to the loop's centre."""
+    on_loop = np.isin(surface.corner_vertices, loop.vertices)
+    beside = on_loop.sum(axis=1) == 2
+    corners = surface.vertices[surface.corner_vertices[beside]]
+    edge = on_loop[beside][..., None]
+    middle = (corners * edge).sum(axis=1) / 2.0
+    away, inward = (corners * ~edge).sum(axis=1) - middle, loop.centre - middle
+    length = np.linalg.norm(away, axis=1) * np.linalg.norm(inward, axis=1)
+    cosine = np.einsum("ij,ij->i", away, inward) / np.maximum(length, 1e-18)
+    return float(cosine.mean()) if len(cosine) else 0.0
 
 
 def _normals(surface: "Surface") -> Array:
@@ -155,13 +205,15 @@ def _heights(points: Array, normals: Array, near: Index) -> tuple[Array, Array]:
     scale = np.maximum(np.linalg.norm(offset, axis=2).max(axis=1), 1e-12)[:, None]
     u, v, w = (np.einsum("nkj,nj->nk", offset, a) / scale for a in (first, second, axis))
     terms = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=2)
-    square = np.einsum("nki,nkj->nij", terms, terms) + 1e-9 * np.eye(6)
-    right = np.einsum("nki,nk->ni", terms, w)
-    fit = np.linalg.solve(square, right[..., None])[..., 0]
-    left = w - np.einsum("nki,ni->nk", terms, fit)
+    turned = np.swapaxes(terms, 1, 2)
+    square = turned @ terms + 1e-9 * np.eye(6)
+    fit = np.linalg.solve(square, turned @ w[..., None])[..., 0]
+    left = w - (terms @ fit[..., None])[..., 0]
     residual = np.sqrt((left**2).mean(axis=1)) * scale[:, 0]
     height = -fit[:, 0] * scale[:, 0]
-    known = np.linalg.eigvalsh(square)[:, 0] > DEFECT.least_eigenvalue
+    known = np.ones(len(points), bool)
+    odd = (np.abs(height) > DEFECT.spike) | (residual > DEFECT.noise)
+    known[odd] = np.linalg.eigvalsh(square[odd])[:, 0] > DEFECT.least_eigenvalue
     # A spike tilts the normals beside it, but its neighbours fit a quadric.
     facing = known & (cosine > 0.0).all(axis=1)
     smooth = known & (cosine > DEFECT.least_cosine).all(axis=1)

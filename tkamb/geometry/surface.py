@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.geometry.frames import Array, Index, Mask, transform
+from tkamb.geometry.frames import MIRROR, Array, Index, Mask, pose, transform
 from tkamb.geometry.topology import Ragged, edge_use, same_places
 
 if TYPE_CHECKING:
@@ -37,6 +37,9 @@ NORMAL = NormalSettings()
 
 SMOOTH_WITHIN = np.radians(30.0)
 """rad: angle between normals above which triangles belong to different smooth surfaces."""
+
+NO_TURN = 1e-3
+"""rad: angle between facets below which they are coplanar. Chosen above the rounding of a file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,10 +223,44 @@ class Surface:
 
     @cached_property
     def defects(self) -> "tuple[Defect, ...]":
-        """The openings, spikes, noise and steps of the surface."""
+        """The openings, spikes, noise and steps of the surface.
+
+        A surface that was `remade` has those of its original.
+        """
         from tkamb.geometry.defects import defects_of
 
-        return defects_of(self)
+        if self._original is None:
+            return defects_of(self)
+        original, pose_there_in_here = self._original
+        return tuple(defect.moved(pose_there_in_here) for defect in original.defects)
+
+    @cached_property
+    def _original(self) -> "tuple[Surface, Array] | None":
+        """The surface that this one was made of, and its affine map to here (4, 4)."""
+        return None
+
+    @cached_property
+    def facet_sag(self) -> float:
+        """Sag, m, of the facets below the smooth surface: the largest but for a tenth of the edges.
+
+        Facets of width w that meet at an angle t are chords of a circle of radius w/t. Their sag is
+        w t/8. Edges of more than 30 deg, and those between coplanar facets, do not count.
+        """
+        edge, count = edge_use(self.corner_vertices)
+        face = np.repeat(np.arange(len(self.faces)), 3)
+        order = np.argsort(edge, kind="stable")
+        first = np.cumsum(count) - count
+        twice = first[count == 2]
+        one, other = face[order[twice]], face[order[twice + 1]]
+        corners = self.triangles
+        lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).reshape(-1)
+        length = np.maximum(lengths[order[twice]], 1e-12)
+        cosine = np.einsum("ij,ij->i", self.face_normals[one], self.face_normals[other])
+        turn = np.arccos(np.clip(cosine, -1.0, 1.0))
+        curved = (turn < SMOOTH_WITHIN) & (turn > NO_TURN)
+        width = (self.areas[one] + self.areas[other]) / length
+        sag = (width * turn / 8.0)[curved]
+        return float(np.quantile(sag, 0.9)) if len(sag) else 0.0
 
     @cached_property
     def volume(self) -> float:
@@ -236,11 +273,37 @@ class Surface:
         if np.array_equal(pose_here_in_there, np.eye(4)):
             return self
         vertices = transform(pose_here_in_there, self.vertices)
-        return Surface(vertices, self.faces, self.name, self.merged)
+        return self.remade(vertices, self.faces, pose_here_in_there)
+
+    def mirrored(self) -> "Surface":
+        """Return the mirror image in the sagittal plane (z to -z), with outward normals."""
+        mirror = pose(MIRROR, np.zeros(3))
+        return self.remade(self.vertices @ MIRROR + 0.0, self.faces[:, ::-1].copy(), mirror)
+
+    def remade(
+        self, vertices: Array, faces: Index, pose_here_in_there: Array | None = None
+    ) -> "Surface":
+        """Return a surface that was made of this one, with the defects of this one.
+
+        Args:
+            vertices: (n, 3) m, moved, worn or more than those of this surface.
+            faces: (k, 3) vertices of the triangles.
+            pose_here_in_there: pose or mirror image (4, 4) that moves the defects; None: identity.
+        """
+        merged = self.merged and len(vertices) == len(self.vertices)
+        remade = Surface(vertices, faces, self.name, merged)
+        there = np.eye(4) if pose_here_in_there is None else pose_here_in_there
+        remade.__dict__["_original"] = (self, there)
+        return remade
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the fields without derived objects, which are larger and can be computed again."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        """Return the fields and the defects without other derived objects.
+
+        The others are larger and can be computed again.
+        """
+        state = {field.name: getattr(self, field.name) for field in fields(self)}
+        known = {} if "defects" not in self.__dict__ else {"defects": self.defects}
+        return state | known
 
 
 def corner_normals(surface: Surface, crease: float, weights: Array) -> Array:

@@ -15,7 +15,7 @@ from tkamb.files import replaced_file
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.topology import separate_bodies
 from tkamb.io.recordings.mesh_check import mended_mesh
-from tkamb.io.recordings.meshes import axes_rotation, load_surface, mirrored
+from tkamb.io.recordings.meshes import axes_rotation, load_surface
 from tkamb.io.vtk import write_lattice
 from tkamb.units import MILLIMETRE
 
@@ -83,7 +83,7 @@ def lattice_of_file(
         raise InputError(f"resolution {resolution_mm} mm", "mesh lattice", hint)
     surface = load_surface(insert, units, axes, name="insert", closed=True)
     if side == "left":
-        surface = mirrored(surface)
+        surface = surface.mirrored()
     elif side != "right":
         raise InputError(f"'{side}' is not a side", "side", "give right or left")
     surface = surface.moved(insert_placement(surface, axes_rotation(axes)))

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from tkamb.errors import InputError
-from tkamb.geometry.frames import MIRROR, Array, inverse, mirrored_pose, transform
+from tkamb.geometry.frames import Array, inverse, mirrored_pose, transform
 from tkamb.geometry.surface import Surface
 from tkamb.knee.anatomy import Anatomy, FixedFrame
 from tkamb.knee.canonical import Bridge, se3
@@ -164,12 +164,6 @@ def _arrays(mesh: Mesh, name: str) -> tuple[Array, Any]:
     return vertices.astype(float), faces.astype(np.int64)
 
 
-def mirrored_surface(surface: Surface) -> Surface:
-    """Return the mirror image in the sagittal plane (z to -z) with outward normals."""
-    faces = surface.faces[:, ::-1].copy()
-    return Surface(surface.vertices @ MIRROR + 0.0, faces, surface.name, surface.merged)
-
-
 @dataclass(frozen=True)
 class AssemblySettings:
     """Tolerance of the assembly."""
@@ -217,7 +211,7 @@ def surfaces_of(
             surfaces.append(None)
             continue
         surface = as_surface(mesh, f"{name} mesh", closed=name == "insert")
-        surfaces.append(mirrored_surface(surface) if is_left else surface)
+        surfaces.append(surface.mirrored() if is_left else surface)
     return Surfaces(*surfaces)
 
 
@@ -301,7 +295,7 @@ def extensor_lines(bridge: Bridge, extensor: Extensor, surfaces: Surfaces) -> "E
         to_component = bridge.component.placement.inverse() * anatomy.femur.placement
         pose = to_component.homogeneous
         if bridge.left:
-            bone, pose = mirrored_surface(bone), mirrored_pose(pose)
+            bone, pose = bone.mirrored(), mirrored_pose(pose)
         wrap = replace(wrap, bone=bone.moved(pose))
     muscle = replace(muscle, points=points, wrap=wrap)
     check_muscles([muscle], bridge.chain)

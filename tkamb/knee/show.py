@@ -11,7 +11,6 @@ import pinocchio as pin
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, Array, mirrored_pose, transform
-from tkamb.knee.parts import mirrored_surface
 from tkamb.knee.pressed import contact_of_equations
 
 if TYPE_CHECKING:
@@ -181,7 +180,7 @@ def _solid(
 ) -> None:
     if surface is None:
         return
-    mesh = mirrored_surface(surface) if is_left else surface
+    mesh = surface.mirrored() if is_left else surface
     material = geometry.MeshPhongMaterial(
         color=COLOURS[part], opacity=opacity, transparent=opacity < 1.0
     )

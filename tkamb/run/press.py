@@ -34,15 +34,16 @@ from tkamb.io.given_material import (
     material_in_words,
     named_material,
 )
-from tkamb.io.recordings.meshes import axes_rotation, check_same_space, load_surface, mirrored
+from tkamb.io.recordings.meshes import axes_rotation, check_same_space, load_surface
 from tkamb.knee.adjustment import press_adjusted
 from tkamb.run.known_errors import (
+    NOT_MEASURED,
+    ContactSituation,
     KnownError,
     as_json,
-    known_error,
     known_error_words,
     left_out,
-    outside_measured,
+    stated_error,
 )
 from tkamb.units import DEGREE, LENGTH, MEGAPASCAL, MILLIMETRE
 
@@ -95,7 +96,8 @@ class PressReport:
         prepare_seconds: computing time of the preparation, s.
         solve_seconds: computing time of the press, s.
         peak_rss_MB: largest resident memory of the process, MB.
-        known_error: known error of the contact model at this resolution; None: not measured.
+        known_error: known error of the contact model at this resolution, or "not measured" with
+            the reason.
     """
 
     contact: str
@@ -110,7 +112,7 @@ class PressReport:
     prepare_seconds: float
     solve_seconds: float
     peak_rss_MB: float
-    known_error: KnownError | None = None
+    known_error: KnownError | str = NOT_MEASURED
 
     def __repr__(self) -> str:
         """Return a line with contact model, load and result."""
@@ -348,9 +350,9 @@ def press_meshes(
         prepare_seconds=prepared - started,
         solve_seconds=solved - prepared,
         peak_rss_MB=peak_rss(),
-        known_error=None
-        if outside_measured(result.flags)
-        else known_error(contact, resolution_mm, pair.material.name, options),
+        known_error=stated_error(
+            contact, resolution_mm, pair.material.name, options, ContactSituation.of(result)
+        ),
     )
 
 
@@ -416,7 +418,7 @@ def load_pair(
     femoral_surface = load_surface(femoral, units, axes, name="femoral")
     insert_surface = load_surface(insert, units, axes, name="insert", closed=True)
     if side == "left":
-        femoral_surface, insert_surface = mirrored(femoral_surface), mirrored(insert_surface)
+        femoral_surface, insert_surface = femoral_surface.mirrored(), insert_surface.mirrored()
         femoral_pose = mirrored_pose(femoral_pose)
     elif side != "right":
         raise InputError(f"'{side}' is no side", "side", "give right or left")

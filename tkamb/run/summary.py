@@ -30,7 +30,7 @@ from tkamb.run.columns import (
 )
 from tkamb.run.discrepancy import discrepancy_summary
 from tkamb.run.identity import relative_paths, scene_hash
-from tkamb.run.known_errors import as_json, known_error, left_out
+from tkamb.run.known_errors import ContactSituation, as_json, left_out, stated_error
 from tkamb.run.read_scene import STRAIN_FLEXIONS
 from tkamb.run.status import FAILED
 from tkamb.settings import changed_settings
@@ -111,8 +111,11 @@ def summary_of(
         table = scene.contact
         from tkamb.io.given_material import given_material, material_as_json
 
-        chosen = material_as_json(given_material(scene.insert_material))
-        error = known_error(table.model, table.resolution_mm, chosen["name"], table.options)
+        material = given_material(scene.insert_material)
+        chosen = material_as_json(material)
+        sag = sum(body.facet_sag for body in (case.femoral, case.insert) if body is not None)
+        peak = ContactSituation.of_run(columns, columns["status"], material.poisson_ratio, sag)
+        error = stated_error(table.model, table.resolution_mm, material.name, table.options, peak)
         summary["contact"] = table.model_dump(mode="json")
         if scene.material is not None:
             del summary["contact"]["material"]  # [material] replaces it

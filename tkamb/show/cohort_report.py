@@ -70,7 +70,7 @@ def cohort_html(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequenc
         headings=[SHOWN[name][:2] for name in _there(groups)],
         rows=[_row(group, _there(groups)) for group in groups],
         plots=list(_plots(groups)),
-        designs=_designs(cohort, groups),
+        designs=_designs(cohort, groups, outcomes),
         wear=_wear_table(groups),
         maps=_maps(cohort, outcomes, groups),
         failed=_failed(cohort, outcomes)[: COHORT_REPORT.most_failed],
@@ -78,9 +78,11 @@ def cohort_html(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequenc
     )
 
 
-def _designs(cohort: Cohort, groups: Sequence[Group]) -> dict[str, str] | None:
+def _designs(
+    cohort: Cohort, groups: Sequence[Group], outcomes: Mapping[int, Outcome]
+) -> dict[str, str] | None:
     """Return the figure of pressure and wear of designs; None without designs or contact."""
-    bars = design_bars(cohort, groups)
+    bars = design_bars(cohort, groups, outcomes)
     if not cohort.table.design or not any(bars.values()):
         return None
     return {"svg": svg_text(draw_designs(bars), "designs"), "words": BANDS}
@@ -90,14 +92,15 @@ def _error_card(cohort: Cohort, outcomes: Mapping[int, Outcome]) -> Card | None:
     """Return the known error of the cohort's contact models; None without contact."""
     words: dict[str, str] = {}
     large = False
-    for n in outcomes:
+    for n, outcome in outcomes.items():
         table = cohort.runs[n].scene.contact
-        if table is None:
+        if table is None or outcome.reason:
             continue
-        error = as_json(run_error(cohort.runs[n]))
+        error = as_json(run_error(cohort.runs[n], outcome))
         material = material_as_json(given_material(cohort.runs[n].scene.insert_material))["name"]
         setting = f"{table.model} at {table.resolution_mm:g} mm, {material}"
-        words[setting] = f"{setting}: {known_error_words(error, PRESSURE_AND_AREA)}"
+        if setting not in words or isinstance(error, str):
+            words[setting] = f"{setting}: {known_error_words(error, PRESSURE_AND_AREA)}"
         large = large or is_large(error, PRESSURE_AND_AREA)
     if not words:
         return None

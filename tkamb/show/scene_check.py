@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tkamb.contact.registry import contact_model
+from tkamb.geometry.defects import mesh_words
 from tkamb.geometry.frames import KNEE_COORDINATES, Array
 from tkamb.geometry.surface import Surface
 from tkamb.io.given_material import (
@@ -176,6 +177,7 @@ def _surface(surface: Surface) -> str:
     return (
         f"{len(surface.faces)} triangles, {size[0]:.1f} mm anterior–posterior, "
         f"{size[1]:.1f} high, {size[2]:.1f} wide"
+        + "".join(f"; {words}" for words in mesh_words(surface))
     )
 
 

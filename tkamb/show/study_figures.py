@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from tkamb.geometry.frames import SIDES, Array
-from tkamb.io.given_material import given_material, material_as_json
-from tkamb.run.known_errors import KnownError, known_error
+from tkamb.io.given_material import given_material
+from tkamb.run.known_errors import ContactSituation, KnownError, stated_error
 from tkamb.show.style import (
     BLUE,
     CYCLE,
@@ -20,6 +20,7 @@ from tkamb.show.style import (
     new_figure,
     settings,
 )
+from tkamb.studies.cohort.outcome import Outcome
 from tkamb.studies.cohort.plan import Cohort, CohortRun
 from tkamb.studies.cohort.statistics import Group
 from tkamb.studies.verdict import KINDS, VERDICT, Verdict
@@ -68,13 +69,14 @@ class Bar:
     most: float
 
 
-def run_error(run: CohortRun) -> KnownError | None:
-    """Return the known error of a run's contact model; None: it is unknown, or no contact."""
+def run_error(run: CohortRun, outcome: Outcome) -> KnownError | str | None:
+    """Return the known error of a run's contact, or "not measured: ..."; None: no contact."""
     table = run.scene.contact
-    if table is None:
+    if table is None or "approach_mm" not in outcome.columns:
         return None
-    material = material_as_json(given_material(run.scene.insert_material))["name"]
-    return known_error(table.model, table.resolution_mm, material, table.options)
+    material = given_material(run.scene.insert_material)
+    peak = ContactSituation.of_run(outcome.columns, outcome.status, material.poisson_ratio)
+    return stated_error(table.model, table.resolution_mm, material.name, table.options, peak)
 
 
 def factor_names(cohort: Cohort) -> list[str]:
@@ -82,7 +84,9 @@ def factor_names(cohort: Cohort) -> list[str]:
     return list(dict.fromkeys(name for design in cohort.table.design for name in design.factors))
 
 
-def design_bars(cohort: Cohort, groups: Sequence[Group]) -> dict[str, list[Bar]]:
+def design_bars(
+    cohort: Cohort, groups: Sequence[Group], outcomes: Mapping[int, Outcome]
+) -> dict[str, list[Bar]]:
     """Return "pressure" and "wear" -> the bars of the groups with such results."""
     result: dict[str, list[Bar]] = {"pressure": [], "wear": []}
     for group in groups:
@@ -90,8 +94,10 @@ def design_bars(cohort: Cohort, groups: Sequence[Group]) -> dict[str, list[Bar]]
         present = [values for values in sides if values is not None]
         if present:
             peaks = np.fmax.reduce(present)
-            errors = [run_error(cohort.runs[n]) for n in group.numbers]
-            share = np.array([one.peak_pressure if one else np.nan for one in errors])
+            errors = [run_error(cohort.runs[n], outcomes[n]) for n in group.numbers]
+            share = np.array(
+                [e.peak_pressure if isinstance(e, KnownError) else np.nan for e in errors]
+            )
             bars = _bar(cohort, group, peaks, peaks * (1 - share), peaks * (1 + share))
             result["pressure"] += bars
         if WEAR in group.wear:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from tkamb.geometry.defects import mesh_words
 from tkamb.geometry.flat_bottom import facing, find_flats
 from tkamb.geometry.frames import Array
 from tkamb.geometry.repair import Repair, connected_parts, repair
@@ -94,6 +95,8 @@ class MeshHealth:
         one_sided: whether no winding of the triangles is consistent.
         units: plausible units: those in which the mesh has the size of a part of a knee.
         flats: the largest flat sides. The first is probably the bottom of an insert.
+        roughness: spikes, noise and steps of the mesh in words, lengths in mm if the first of
+            `units` is the file's unit.
     """
 
     file: str
@@ -111,6 +114,7 @@ class MeshHealth:
     one_sided: bool
     units: tuple[str, ...]
     flats: tuple[FlatSide, ...]
+    roughness: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """Return all fields as plain data."""
@@ -170,7 +174,10 @@ class MeshHealth:
             lines.append(f"  not a surface: three or more sheets meet at {self.forks} vertices")
         if self.one_sided:
             lines.append("  not a surface: it has only one side")
-        return lines
+        return [
+            *lines,
+            *(f"  a contact there cannot be relied on: {one}" for one in self.roughness),
+        ]
 
     def _unit_question(self) -> str:
         if not self.units:
@@ -223,7 +230,16 @@ def check_mesh(path: str | Path) -> MeshHealth:
         one_sided=mended.one_sided,
         units=tuple(units),
         flats=_flats(mended, str(path)),
+        roughness=_roughness(mended, units),
     )
+
+
+def _roughness(mended: Repair, units: list[str]) -> tuple[str, ...]:
+    """Return the spikes, noise and steps of a mesh in words; openings have lines of their own."""
+    if not units or not len(mended.faces):
+        return ()
+    words = mesh_words(Surface(mended.vertices, mended.faces, merged=True))
+    return tuple(one for one in words if "opening" not in one)
 
 
 def mended_mesh(path: str | Path) -> tuple[Repair, float]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tkamb.errors import InputError
 from tkamb.files import FILE_LIMITS, check_file
 from tkamb.geometry.condyles import condyle_split
-from tkamb.geometry.frames import MIRROR, Array
+from tkamb.geometry.frames import Array
 from tkamb.geometry.polygons import triangulated
 from tkamb.geometry.repair import InnerWall, Repair, find_inner_wall, repair, touching_groups
 from tkamb.geometry.surface import Surface
@@ -201,15 +201,6 @@ def _check_space(path: str | Path, axes: str) -> None:
             f"give axes {SPACES[space]}; if the mesh was moved to other axes, delete the space "
             "from its header",
         )
-
-
-def mirrored(surface: Surface) -> Surface:
-    """Return the mirror image in the sagittal plane (z to -z), with outward normals.
-
-    A part of a left knee, in anatomical axes, becomes a part of a right knee.
-    """
-    vertices, faces = surface.vertices @ MIRROR + 0.0, surface.faces[:, ::-1].copy()
-    return Surface(vertices, faces, surface.name, surface.merged)
 
 
 def read_triangles(path: str | Path) -> tuple[Array, Indices]:

@@ -128,9 +128,7 @@ class ImplantParts:
         return self._right(surface.moved(placement)), mesh_in_link
 
     def _right(self, surface: "Surface") -> "Surface":
-        from tkamb.io.recordings.meshes import mirrored
-
-        return mirrored(surface) if self._left else surface
+        return surface.mirrored() if self._left else surface
 
 
 def muscle_tables(scene: Scene) -> tuple[MuscleTable, ...]:
@@ -242,7 +240,7 @@ def _bone(table: BoneTable | None, chain: Chain, left: bool) -> "Surface | None"
     """Return a bone's surface in the femur link's frame."""
     if table is None:
         return None
-    from tkamb.io.recordings.meshes import BONE_SIZE, load_surface, mirrored
+    from tkamb.io.recordings.meshes import BONE_SIZE, load_surface
 
     surface = load_surface(table.mesh, table.unit, table.axes, name="bone", size=BONE_SIZE)
-    return (mirrored(surface) if left else surface).moved(chain.link_in(table.link, "femur"))
+    return (surface.mirrored() if left else surface).moved(chain.link_in(table.link, "femur"))

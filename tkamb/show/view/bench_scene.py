@@ -28,7 +28,6 @@ from tkamb.io.toml_text import table_lines
 from tkamb.knee.knee import Knee
 from tkamb.knee.ligament_laws import law_name
 from tkamb.knee.load import LinkPoint
-from tkamb.knee.parts import mirrored_surface
 from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:
@@ -219,7 +218,7 @@ def write_knee(knee: Knee, placement: Array, coordinates: Array, folder: Path) -
     )
     lines += table_lines("[motion]", motion.model_dump(include=motion.model_fields_set))
     for name, surface in (("femoral", knee.femoral), ("insert", knee.insert)):
-        _write_obj(folder / f"{name}.obj", mirrored_surface(surface) if knee.left else surface)
+        _write_obj(folder / f"{name}.obj", surface.mirrored() if knee.left else surface)
         mesh = {"mesh": f"{name}.obj", "unit": "m"}
         if name == "insert":
             mesh["bearing"] = knee.implant.bearing

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from tkamb.contact.registry import contact_names
+from tkamb.contact.result import ContactResult
 from tkamb.errors import InputError, TkambError
 from tkamb.geometry.frames import KNEE_COORDINATES, SIDES, Array, Index, knee_pose
 from tkamb.io.recordings.patient import load_urdf
@@ -20,7 +21,7 @@ from tkamb.io.scene.case import Case, with_insert
 from tkamb.knee.chain import Chain
 from tkamb.knee.frame import Frame, FrameStart
 from tkamb.run.guard import unforeseen_words
-from tkamb.run.known_errors import as_json, known_error
+from tkamb.run.known_errors import NOT_MEASURED, ContactSituation, as_json, stated_error
 from tkamb.run.read_scene import SharedState, recording_of
 from tkamb.run.recording import Recording
 from tkamb.show.view.bench import BENCH_LIMIT, ROWS, Bench, BenchRequest
@@ -105,6 +106,7 @@ class LiveAnswer:
         gap: (n,) m, distance between the surfaces at the points.
         ligaments: name -> (2, 3) m, ends of the ligament, insert frame.
         centres: side -> (3,) m, centre of pressure, insert frame.
+        error: known error of the contact model for this contact, or "not measured: ...".
     """
 
     request: BenchRequest
@@ -117,6 +119,7 @@ class LiveAnswer:
     gap: Array
     ligaments: dict[str, Array]
     centres: dict[str, Array]
+    error: dict[str, Any] | str = NOT_MEASURED
 
     @property
     def failed(self) -> bool:
@@ -381,18 +384,19 @@ class LiveKnee:
                 for side in SIDES
                 if getattr(result, side) is not None
             },
+            self._known_error(request, result),
         )
 
-    def known_error(self, request: BenchRequest) -> Any:
-        """Return the known errors of the chosen contact model, or "not measured"."""
+    def _known_error(self, request: BenchRequest, result: ContactResult) -> Any:
+        """Return the known errors of the chosen contact model, or "not measured: ..."."""
         scene = self.case.scene
         assert scene.contact is not None
         if scene.material is not None:
             return as_json(None)
         same_model = request.contact == scene.contact.model
         options = scene.contact.options if same_model else {}
-        material = scene.contact.material
-        return as_json(known_error(request.contact, request.resolution_mm, material, options))
+        material, at = scene.contact.material, ContactSituation.of(result)
+        return as_json(stated_error(request.contact, request.resolution_mm, material, options, at))
 
 
 def _numbers(frame: Frame, recording: Recording, ends: dict[str, Array]) -> dict[str, float]:

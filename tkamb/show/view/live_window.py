@@ -21,6 +21,7 @@ from tkamb.geometry.frames import (
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import Case, load_case
 from tkamb.knee.knee import Knee
+from tkamb.run.known_errors import NOT_MEASURED
 from tkamb.show.pages import asset, policy_sources, render
 from tkamb.show.style import SIDE_COLOURS
 from tkamb.show.view.bench import BenchRequest, still_motion
@@ -171,7 +172,7 @@ class LiveWindow:
             "request": asdict(answer.request),
             "label": f"{answer.request.contact} at {answer.request.resolution_mm:g} mm",
             "map": "/".join(map(str, setting(answer.request))),
-            "error": self._error_words(answer.request),
+            "error": _error_words(answer.error),
             "scale_MPa": scale,
             "numbers": numbers,
             "pose": answer.pose.T.ravel().tolist() if finite else None,
@@ -188,15 +189,6 @@ class LiveWindow:
                 f"{side} centre": centre.tolist() for side, centre in answer.centres.items()
             },
         }
-
-    def _error_words(self, request: BenchRequest) -> str:
-        error = self.knee.known_error(request)
-        if isinstance(error, str):
-            return f"its error is {error} at this spacing"
-        return (
-            f"on the studied cases its error is at most {100 * error['peak_pressure']:.2g} % in "
-            f"peak pressure, {100 * error['area']:.2g} % in area"
-        )
 
     def _keep(self, request: BenchRequest) -> bytes:
         """Save the state as a scene; return its answer without an initial guess and its file.
@@ -363,3 +355,12 @@ def bench_of_knee(knee: Knee, q: Any) -> LiveKnee:
         shutil.rmtree(session, ignore_errors=True)
         raise
     return LiveKnee(replace(case, motion=still_motion(coordinates)), session)
+
+
+def _error_words(error: dict[str, Any] | str) -> str:
+    if isinstance(error, str):
+        return f"its error is {error}" + (" at this spacing" if error == NOT_MEASURED else "")
+    return (
+        f"on the studied cases its error is at most {100 * error['peak_pressure']:.2g} % in "
+        f"peak pressure, {100 * error['area']:.2g} % in area"
+    )

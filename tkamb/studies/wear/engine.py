@@ -1,6 +1,6 @@
 """Contact in a wear computation: the pressure maps of a cycle at the insert's vertices."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +8,7 @@ from scipy.optimize import minimize
 from scipy.sparse import csr_array
 from scipy.spatial import Delaunay
 
+from tkamb.contact.flags import unmeasured_flags
 from tkamb.contact.materials import Material
 from tkamb.contact.model import ContactModel
 from tkamb.contact.pair import Bearing, ContactPair
@@ -48,6 +49,7 @@ class CycleMaps:
         pressure: contact pressure, Pa, shape (f, m).
         poses: femoral poses of the maps, shape (f, 4, 4). A frame without load has its given pose.
         failed: frame -> reason why its contact or equilibrium failed.
+        flagged: frame -> flag of a contact at a defect of a mesh or over an unsupported bottom.
     """
 
     points: Array
@@ -55,6 +57,7 @@ class CycleMaps:
     pressure: Array
     poses: Array
     failed: dict[int, str]
+    flagged: dict[int, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +77,7 @@ class ContactEngine:
         pair = ContactPair(self.femoral, insert, self.material, self.bearing)
         state = self.model.prepare(pair)
         pressure = np.zeros((len(motion), len(state.points)))
-        poses, failed, warm_start = motion.poses.copy(), {}, None
+        poses, failed, flagged, warm_start = motion.poses.copy(), {}, {}, None
         drive = motion.drive
         equilibrium = None if drive is None else EquilibriumPoses(self.model, state, drive)
         for k, (pose, load) in enumerate(zip(motion.poses, motion.load, strict=True)):
@@ -90,7 +93,9 @@ class ContactEngine:
                 failed[k] = "; ".join(result.flags) or result.status.value
                 continue
             pressure[k], poses[k], warm_start = result.pressure, result.pose, end
-        return CycleMaps(state.points, state.triangles, pressure, poses, failed)
+            if beyond := unmeasured_flags(result.flags):
+                flagged[k] = beyond[0]
+        return CycleMaps(state.points, state.triangles, pressure, poses, failed, flagged)
 
     def dwell(self, insert: Surface, rotation: Array) -> tuple[float, float]:
         """Return the dwell position: x and z, m, where the femoral component lies lowest.

@@ -224,6 +224,10 @@ class WearReport:
                 f"up to {failed_rows:.0f} of {len(self.case.motion)} rows of the profile failed, "
                 f"and the cycle omits them: {reason}"
             )
+        if self.last.flagged:
+            flag = next(iter(self.last.flagged.values()))
+            count = len(self.last.flagged)
+            questions.append(f"in {count} of {len(self.case.motion)} rows {flag}")
         if self.setup.engine.bearing == "mobile":
             questions.append("the wear of the back of a mobile bearing is not modelled")
         if self.bands is not None:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -129,6 +129,7 @@ class CycleWear:
         map_error: largest relative correction of the force of a map.
         poses: femoral poses of the frames of the motion, shape (f, 4, 4).
         failed: frame -> reason why it failed.
+        flagged: frame -> flag of a contact for which no model's error is known.
     """
 
     rate: Array
@@ -138,6 +139,7 @@ class CycleWear:
     map_error: float
     poses: Array
     failed: Mapping[int, str]
+    flagged: Mapping[int, str] = field(default_factory=dict)
 
     @property
     def peak_pressure(self) -> Array:
@@ -253,7 +255,7 @@ def _cycle_wear(case: WearCase, insert: Surface, maps: CycleMaps, rows: list[int
     passes = case.motion.passes
     history = SlidingHistory.of_cycle(poses, pressure, points, normals, passes, seconds)
     rate = case.law.depth(history)
-    return CycleWear(rate, history, normals, area, error, maps.poses, maps.failed)
+    return CycleWear(rate, history, normals, area, error, maps.poses, maps.failed, maps.flagged)
 
 
 @dataclass(frozen=True, eq=False)

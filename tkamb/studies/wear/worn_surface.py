@@ -67,11 +67,12 @@ class ArticularSurface:
         """
         merged = insert.mesh.copy()
         merged.merge_vertices()
-        surface = refined(
+        finer = refined(
             Surface(np.asarray(merged.vertices), np.asarray(merged.faces), insert.name),
             spacing,
             lambda s: s.face_normals[:, 1] > WORN_SURFACE.min_normal_y,
         )
+        surface = insert.remade(finer.vertices, finer.faces)
         upward, total = area_vectors(surface)
         length = np.linalg.norm(upward, axis=1)
         up = np.flatnonzero((upward[:, 1] > WORN_SURFACE.min_normal_y * length) & (total[:, 1] > 0))
@@ -94,7 +95,7 @@ class ArticularSurface:
         """Return the insert with its articular vertices moved down by `fall`, m, shape (n,)."""
         vertices = self.surface.vertices.copy()
         vertices[self.vertices, 1] -= fall
-        return Surface(vertices, self.surface.faces, self.surface.name)
+        return self.surface.remade(vertices, self.surface.faces)
 
     def normals_and_areas(self, lowered: Surface) -> tuple[Array, Array]:
         """Return unit normals (n, 3) and areas, m², (n,) of the vertices of a lowered surface."""
