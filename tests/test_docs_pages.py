@@ -112,7 +112,7 @@ def test_every_module_that_the_architecture_names_exists():
 
 def test_the_architecture_shows_the_way_of_a_frame():
     """The list names the files that a frame enters, in order; none of them is in io/."""
-    loader = SourceFileLoader("trace_frame", str(ROOT / "scripts" / "trace_frame"))
+    loader = SourceFileLoader("trace_frame", str(ROOT / "scripts" / "make" / "frame_trace"))
     trace = module_from_spec(spec_from_loader("trace_frame", loader))
     loader.exec_module(trace)
     page = (DOCS / "architecture.md").read_text(encoding="utf-8")
@@ -120,6 +120,6 @@ def test_the_architecture_shows_the_way_of_a_frame():
     files, traced = (
         re.findall(r"^ +\S+\.py", t, re.M) for t in (shown, trace.table(trace.traced()))
     )
-    assert files == traced, "run scripts/trace_frame"
+    assert files == traced, "run scripts/make/frame_trace"
     assert f"It enters {len(files)} files" in shown
     assert not any(name.strip().startswith("io/") for name in files)

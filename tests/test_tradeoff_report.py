@@ -161,7 +161,7 @@ def test_stored_known_errors_and_their_page_agree_with_both_studies():
     )
     entries = json.loads(STORED.read_text(encoding="utf-8"))
     assert with_block(page, stated_table(entries), "stated-errors") == page, (
-        "run scripts/make_tradeoff_table"
+        "run scripts/make/tradeoff_table"
     )
     (variant,) = [e for key, e in known_errors().items() if key[0] == "lattice[tolerance=0.01]"]
     widened = 1.0 + WIDENING / variant.pairs
