@@ -8,6 +8,7 @@ foot, a leg that hangs from a pelvis, and a whole body.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
@@ -69,6 +70,16 @@ class Anatomy:
     def fixed(self) -> bool:
         """Whether the tibia is fixed to the universe."""
         return self.tibia.joint == 0
+
+    @cached_property
+    def angles(self) -> dict[int, str]:
+        """Index in q -> name of a joint of the knee whose coordinate is an angle."""
+        joints = {joint: self.model.joints[joint] for joint in self.knee_joints}
+        return {
+            joint.idx_q: self.model.names[index]
+            for index, joint in joints.items()
+            if joint.nq == 1 and joint.shortname().startswith(("JointModelR", "JointModelH"))
+        }
 
     def frame(self, name: str) -> FixedFrame:
         """Return the frame of a part of the knee, or of a name in the model.
