@@ -324,10 +324,12 @@ class AssembledKnee:
         array = np.asarray(values, float)
         if array.shape != (size,):
             raise InputError(f"{name} has the shape {array.shape}", "Knee", f"give ({size},)")
-        # Comparisons with NaN are false: a NaN in v would give forces without friction.
-        if not np.isfinite(array).all():
-            k = int(np.flatnonzero(~np.isfinite(array))[0])
-            raise InputError(f"{name}[{k}] is {array[k]}", "Knee", "give finite numbers")
+        # Comparisons with NaN are false: a NaN in v would give forces without friction. The patella
+        # of a recorded motion is NaN in a frame in which its equilibrium was not found.
+        patella = self.anatomy.patella_q if name == "q" else self.anatomy.patella_v
+        for k in np.flatnonzero(~np.isfinite(array)):
+            if k not in patella:
+                raise InputError(f"{name}[{k}] is {array[k]}", "Knee", "give finite numbers")
         return array
 
     def _check_q(self, q: Array) -> Array:
@@ -338,7 +340,7 @@ class AssembledKnee:
             if abs(q[k]) > KNEE_CHECK.max_turn:
                 words = f"joint '{joint}' is at {q[k]:.4g} rad; is it in degrees?"
                 raise InputError(words, "Knee", "give q in radians")
-        if not pin.isNormalized(self.model, q, KNEE_CHECK.unit_tolerance):
+        if not pin.isNormalized(self.model, q, KNEE_CHECK.unit_tolerance) and np.isfinite(q).all():
             unit = q.copy()
             pin.normalize(self.model, unit)
             error = float(np.abs(q - unit).max())
