@@ -1,5 +1,6 @@
 """What a `tkamb.Knee` takes and returns: frames of the user's knee, and traps that are refused."""
 
+import inspect
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -138,6 +139,9 @@ def test_failure_is_a_bool_a_status_and_a_sentence(read):
     assert "1e+06 N cannot be reached" in result.reason
     assert " mm deep, at most " in result.reason
     assert knee.press(motion.q[60], 500.0).failed is False
+    found = knee.equilibrium(*at(read, 60))
+    assert found.failed is False and found.status.name == "OK" and found.reason == ""
+    assert found.loads.failed is False and found.loads.reason == ""
 
 
 def test_names_of_frames(read):
@@ -180,6 +184,9 @@ def test_a_femur_far_from_the_insert_or_below_it_is_refused(sides):
         far[8] += height
         calls = (
             lambda far=far: knee.external_forces(far, v),
+            lambda far=far: knee.stiffness(far, v),
+            lambda far=far: knee.condyle_forces(far),
+            lambda far=far: knee.forward_dynamics_derivatives(far, v, v),
             lambda far=far: knee.evaluate(far),
             lambda far=far: knee.inverse_dynamics(far, v, a, fext),
         )
@@ -196,6 +203,48 @@ def test_points_in_millimetres_are_refused(read):
         tkamb.Knee(plain.model, ligaments=[tkamb.Ligament("MCL", *ends, law, 85.0)])
     with pytest.raises(InputError, match=r"361.2 m from the frame 'tibia'"):
         tkamb.Knee(plain.model, muscles=[tkamb.Muscle("gastrocnemius", ends[::-1])])
+
+
+def test_lengths_in_millimetres_and_names_given_twice_are_refused(read):
+    plain = without_patella(read[0])
+    bundle, line = plain.ligaments[0], plain.extensor.patellar_ligament
+    with pytest.raises(InputError, match=r"slack_length 85 m; is it in millimetres"):
+        plain.with_ligaments([replace(bundle, slack_length=85.0)])
+    long = replace(plain.extensor, patellar_ligament=replace(line, length=50.0))
+    with pytest.raises(InputError, match=r"patellar ligament: length 50 m; is it in millimetres"):
+        tkamb.Knee(plain.model, implant=plain.implant, extensor=long)
+    with pytest.raises(InputError, match=f"two are named '{bundle.name}'"):
+        plain.with_ligaments([bundle, bundle])
+    named = tkamb.Muscle("quadriceps", (("femur", np.zeros(3)), ("tibia", np.zeros(3))))
+    with pytest.raises(InputError, match="two are named 'quadriceps'"):
+        tkamb.Knee(plain.model, implant=plain.implant, extensor=plain.extensor, muscles=[named])
+
+
+def test_angles_in_degrees_and_numbers_that_are_not_finite_are_refused(read):
+    """Without the checks, a NaN in v gave forces without friction."""
+    knee, motion, _ = read
+    q, v = motion.q[60], motion.v[60]
+    degrees, model = q.copy(), knee.model
+    k = model.joints[model.getJointId("knee_flexion")].idx_q
+    degrees[k] = np.rad2deg(q[k])
+    words = rf"joint 'knee_flexion' is at {degrees[k]:.4g} rad; is it in degrees\?"
+    nothing = np.full(model.nv, np.nan)
+    for call, refused in (
+        (lambda: knee.external_forces(degrees, v), words),
+        (lambda: knee.press(degrees, 500.0), words),
+        (lambda: knee.coordinates(degrees), words),
+        (
+            lambda: knee.press(np.where(np.arange(model.nq) == 3, np.nan, q), 500.0),
+            r"q\[3\] is nan",
+        ),
+        (lambda: knee.external_forces(q, nothing), r"v\[0\] is nan"),
+        (lambda: knee.inverse_dynamics(q, v, nothing), r"a\[0\] is nan"),
+        (lambda: knee.forward_dynamics(q, v, nothing), r"tau\[0\] is nan"),
+        (lambda: knee.press(q, [500.0, 600.0]), r"shape \(2,\)"),
+        (lambda: knee.inverse_dynamics(q, v, v, np.zeros((model.njoints, 6))), "holds ndarray"),
+    ):
+        with pytest.raises(InputError, match=refused):
+            call()
 
 
 def test_a_quaternion_that_is_not_normalised_is_refused(sides):
@@ -266,10 +315,17 @@ def test_the_page_on_stable_names_lists_what_is_public():
         assert re.findall(r"`(\w+)`", row.split(":", 1)[1]) == sorted(names)
 
 
-def test_internals_are_private(read):
+def test_internals_are_private_and_arguments_have_one_name(read):
     public = {name for name in dir(read[0]) if not name.startswith("_")}
     assert not public & {"instant", "at", "link_poses", "query", "create_data_for_kinematics",
                          "press_from", "live"}  # fmt: skip
+    arguments = {
+        argument
+        for name in public
+        if callable(getattr(tkamb.Knee, name, None))
+        for argument in inspect.signature(getattr(tkamb.Knee, name)).parameters
+    }
+    assert {"data", "fext"} <= arguments and not arguments & {"guess", "start", "external"}
 
 
 def test_a_pose_is_given_as_se3_or_as_a_matrix(read):

@@ -71,6 +71,35 @@ class Anatomy:
         """Whether the tibia is fixed to the universe."""
         return self.tibia.joint == 0
 
+    @cached_property
+    def angles(self) -> dict[int, str]:
+        """Index in q -> name of a joint of the knee whose coordinate is an angle."""
+        joints = {joint: self.model.joints[joint] for joint in self.knee_joints}
+        return {
+            joint.idx_q: self.model.names[index]
+            for index, joint in joints.items()
+            if joint.nq == 1 and joint.shortname().startswith(("JointModelR", "JointModelH"))
+        }
+
+    @cached_property
+    def patella_q(self) -> frozenset[int]:
+        """Indices in q of the joints between femur and patella."""
+        joints = self._patella_joints
+        return frozenset(k for one in joints for k in range(one.idx_q, one.idx_q + one.nq))
+
+    @cached_property
+    def patella_v(self) -> frozenset[int]:
+        """Indices in v of the joints between femur and patella."""
+        joints = self._patella_joints
+        return frozenset(k for one in joints for k in range(one.idx_v, one.idx_v + one.nv))
+
+    @property
+    def _patella_joints(self) -> list[pin.JointModel]:
+        if self.patella is None:
+            return []
+        path = _path(self.model, self.femur.joint, self.patella.joint)
+        return [self.model.joints[joint] for joint in path]
+
     def frame(self, name: str) -> FixedFrame:
         """Return the frame of a part of the knee, or of a name in the model.
 

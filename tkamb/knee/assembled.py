@@ -25,6 +25,7 @@ from tkamb.knee.parts import (
     Extensor,
     Implant,
     bundle_on_chain,
+    check_names,
     crossing_and_others,
     extensor_lines,
     placed_insert,
@@ -52,6 +53,9 @@ class KneeCheckSettings:
     max_distance: float = 0.1
     """m: largest distance of the components. Chosen because the ligaments of a knee tear at 20 mm
     of distraction."""
+    max_turn: float = 2.0 * np.pi
+    """rad: largest angle of a joint of the knee; a larger one is probably in degrees. Chosen
+    because no joint of a knee makes a full turn."""
 
 
 KNEE_CHECK = KneeCheckSettings()
@@ -126,9 +130,10 @@ class AssembledKnee:
         component = self.anatomy.femoral
         self.chain = CanonicalChain(self.anatomy, is_left, extensor is not None, component, insert)
         self.bridge = Bridge(self.anatomy, is_left, self.chain, component, insert)
+        self.extensor, muscles = extensor, tuple(muscles)
+        check_names("muscles", [*self._extensor_names, *(muscle.name for muscle in muscles)])
         self._lines = tension_lines(muscles, self.anatomy)
         self._set_ligaments(ligaments)
-        self.extensor = extensor
         self.extensor_lines: ExtensorLines | None = None
         if extensor is not None:
             self.extensor_lines = extensor_lines(self.bridge, extensor, self._surfaces)
@@ -141,6 +146,7 @@ class AssembledKnee:
 
     def _set_ligaments(self, bundles: "Iterable[Ligament]") -> None:
         self.ligaments = tuple(bundle_on_chain(self.bridge, bundle) for bundle in bundles)
+        check_names("ligaments", [bundle.name for bundle in self.ligaments])
         self._crossing, self._others = crossing_and_others(self.chain, self.ligaments)
 
     def with_ligaments(self, ligaments: "Iterable[Ligament]") -> Self:
@@ -318,11 +324,22 @@ class AssembledKnee:
         array = np.asarray(values, float)
         if array.shape != (size,):
             raise InputError(f"{name} has the shape {array.shape}", "Knee", f"give ({size},)")
+        # Comparisons with NaN are false: a NaN in v would give forces without friction. The patella
+        # of a recorded motion is NaN in a frame in which its equilibrium was not found.
+        patella = self.anatomy.patella_q if name == "q" else self.anatomy.patella_v
+        for k in np.flatnonzero(~np.isfinite(array)):
+            if k not in patella:
+                raise InputError(f"{name}[{k}] is {array[k]}", "Knee", "give finite numbers")
         return array
 
     def _check_q(self, q: Array) -> Array:
-        """Return q after a check of its size, and of its quaternions."""
+        """Return q after a check of its size, its quaternions and the angles of the knee."""
         q = self._check(q, "q", self.model.nq)
+        # 60 rad have a valid pose, of another flexion: the result would look right.
+        for k, joint in self.anatomy.angles.items():
+            if abs(q[k]) > KNEE_CHECK.max_turn:
+                words = f"joint '{joint}' is at {q[k]:.4g} rad; is it in degrees?"
+                raise InputError(words, "Knee", "give q in radians")
         if not pin.isNormalized(self.model, q, KNEE_CHECK.unit_tolerance) and np.isfinite(q).all():
             unit = q.copy()
             pin.normalize(self.model, unit)

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from tkamb.errors import ComputationError
+from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array
 from tkamb.knee.knee import Knee, KneeData
 
@@ -89,7 +89,8 @@ def implicit_step(
         q_middle = pin.integrate(model, q, theta * step * v_middle)
         try:
             forces = knee.external_forces(q_middle, v_middle, tensions, data)
-        except ComputationError:  # out of the contact model's range: halve Newton's step
+        # Newton's step leads out of the contact model's range, or far from the knee: halve it.
+        except (ComputationError, InputError):
             if not change.any():
                 raise
             change = change / 2.0

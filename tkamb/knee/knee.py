@@ -522,6 +522,10 @@ class Knee(AssembledKnee):
             from tkamb.knee.batches import press_all
 
             return press_all(self, q, load, data, derivatives)
+        if np.ndim(load):
+            raise InputError(
+                f"shape {np.shape(load)}", "load", "one q has one load; or give (n, nq)"
+            )
         result, start = self._press_from(q, float(load), data)
         of_user = contact_of_user(result, self.left)
         return (of_user, self._press_slopes(result, start)) if derivatives else of_user
@@ -746,12 +750,17 @@ class Knee(AssembledKnee):
             raise InputError(
                 f"{len(fext)} forces", "fext", f"give one per joint, {self.model.njoints}"
             )
+        if fext is not None and not all(isinstance(force, pin.Force) for force in fext):
+            raise InputError(
+                f"holds {type(fext[0]).__name__}", "fext", "give a pin.Force per joint, as pin.rnea"
+            )
 
     def _contact_at(self, data: KneeData, kinematics: KneePose) -> "ProbedContact":
         """Return the contact at a pose. The last contact is stored in `data`."""
         key = kinematics.pose.tobytes()
         if data.seen is None or data.seen[0] != key:
             assert self.contact is not None
+            self._check_place(kinematics.pose)
             data.seen = key, self.contact.at(data.probe, kinematics.pose)
         return data.seen[1]
 

@@ -50,6 +50,29 @@ class PartSettings:
 PART = PartSettings()
 
 
+def check_names(what: str, names: Sequence[str]) -> None:
+    """Raise an error if two lines have one name.
+
+    Raises:
+        InputError: see above.
+    """
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"two are named '{name}'", what, "give each its own name")
+
+
+def check_length(length: float, what: str, where: str) -> None:
+    """Raise an error if a length of a line is not positive, or is in millimetres.
+
+    Raises:
+        InputError: see above.
+    """
+    if not length > 0:
+        raise InputError(f"{what} {length} m", where, f"give {what} in metres")
+    if length > PART.max_length:
+        raise InputError(f"{what} {length:.4g} m", where, "is it in millimetres? give metres")
+
+
 @dataclass(frozen=True, eq=False)
 class Implant:
     """The parts of a total knee replacement, SI.
@@ -240,12 +263,7 @@ def bundle_on_chain(bridge: Bridge, bundle: "Ligament") -> "Ligament":
         InputError: the slack length is missing, or an end is on a frame outside the knee.
     """
     ends = [bridge.link_point(link_point(end)) for end in (bundle.proximal, bundle.distal)]
-    if not bundle.slack_length > 0:
-        raise InputError(
-            f"slack length {bundle.slack_length} m",
-            f"ligament {bundle.name}",
-            "give slack_length in metres",
-        )
+    check_length(bundle.slack_length, "slack_length", f"ligament {bundle.name}")
     return replace(bundle, proximal=ends[0], distal=ends[1])
 
 
@@ -301,10 +319,8 @@ def extensor_lines(bridge: Bridge, extensor: Extensor, surfaces: Surfaces) -> "E
     check_muscles([muscle], bridge.chain)
     ends = [bridge.link_point(link_point(p)) for p in (ligament.proximal, ligament.distal)]
     ligament = replace(ligament, proximal=ends[0], distal=ends[1])
-    if anatomy.patella is None and not ligament.length > 0:
-        raise InputError(
-            "has no length", "patellar ligament", "give length: it determines the patella's pose"
-        )
+    if anatomy.patella is None:
+        check_length(ligament.length, "length", "patellar ligament")
     return ExtensorLines(
         ExtensorParts(
             muscle, ligament, bridge.chain, surfaces.femoral, surfaces.button, surfaces.insert
@@ -316,6 +332,7 @@ def prepared_contact(
     contact: "ContactModel | KneeContact | str", implant: Implant, surfaces: Surfaces, cache: bool
 ) -> "KneeContact":
     """Return a contact model that is prepared for the surfaces of an implant."""
+    from tkamb.contact.model import ContactModel
     from tkamb.contact.pair import ContactPair
     from tkamb.contact.registry import contact_model
     from tkamb.knee.contact import KneeContact
@@ -323,6 +340,10 @@ def prepared_contact(
     if isinstance(contact, KneeContact):
         return contact
     model = contact_model(contact) if isinstance(contact, str) else contact
+    if not isinstance(model, ContactModel):
+        raise InputError(
+            f"{model!r} is no contact model", "contact", "give tkamb.contact_model(name) or a name"
+        )
     if hasattr(model, "cache") and not cache:
         model = replace(model, cache=False)  # type: ignore[type-var]
     assert surfaces.femoral is not None and surfaces.insert is not None

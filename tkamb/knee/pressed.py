@@ -1,15 +1,12 @@
 """The contact that `tkamb.Knee` returns: in the frames of the user's knee, right or left."""
 
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tkamb.contact.result import CondyleContact, ContactResult
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, mirrored_pose
 from tkamb.knee.canonical import mirrored_spatial, se3
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True, eq=False, repr=False)
