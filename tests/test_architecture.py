@@ -2,6 +2,7 @@
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -98,6 +99,39 @@ def test_modules_are_imported_by_a_computed_name_only_in_the_registry(folder):
         if re.search(r"import_module\((?!\")", path.read_text(encoding="utf-8"))
     }
     assert users <= {"named_classes.py"}
+
+
+@cache
+def names_in(module):
+    """Return the names at the top of a module, and its submodules; None: no module of tkamb."""
+    path = PACKAGE.parent.joinpath(*module.split("."))
+    file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    if not file.exists():
+        return None
+    names = {inner.stem for inner in path.iterdir()} if path.is_dir() else set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            names.update(alias.asname or alias.name for alias in node.names)
+        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names.add(node.name)
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            names.add(node.id)
+    return names
+
+
+def test_scripts_import_names_that_exist():
+    """A script that no test runs would break unseen if a name of the package changes."""
+    scripts = (path for path in (PACKAGE.parent / "scripts").rglob("*") if path.is_file())
+    texts = {path: path.read_bytes() for path in scripts if path.suffix in ("", ".py")}
+    python = {path: text for path, text in texts.items() if path.suffix or b"python" in text[:40]}
+    assert len(python) > 50
+    for path, text in python.items():
+        for node in ast.walk(ast.parse(text)):
+            module = getattr(node, "module", None) or ""
+            if module.startswith("tkamb.") and isinstance(node, ast.ImportFrom):
+                names, missing = names_in(module), {alias.name for alias in node.names}
+                assert names is not None, f"{path.name} imports {module}"
+                assert missing <= names, f"{path.name} imports {missing - names} from {module}"
 
 
 def test_physics_does_not_import_scenes_or_files():

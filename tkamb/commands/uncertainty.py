@@ -210,6 +210,8 @@ def warnings_of(uncertainty: "Uncertainty") -> list[str]:
             f"{NOTABLE_FAILED:.0%} of the samples failed (at most {share.max():.0%}), most often: "
             f"{why}; their bands hold for the poses that are possible, see failed_share"
         )
+    if summary.get("unbalanced_patella"):
+        lines.append(summary["unbalanced_patella"])
     if not uncertainty.tornado:
         lines.append("too few samples for tornado.csv: give 6 per input or more")
     return lines

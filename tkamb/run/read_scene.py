@@ -243,9 +243,10 @@ def _extensor_frames(
 
     motion, recorded = case.motion, None
     assert case.scene.patella is not None and knee.extensor_lines is not None
-    if shared is not None and case.scene.patella.motion == "solved":
+    if shared is not None:
         assert shared.extensor is not None
-        return shared.extensor.moved(knee.extensor_lines, poses, shared.frames)
+        given = motion.patella if case.scene.patella.motion == "recorded" else None
+        return shared.extensor.moved(knee.extensor_lines, poses, shared.frames, given)
     if case.scene.patella.motion == "recorded":
         if motion.patella is None:
             raise InputError(

@@ -42,6 +42,7 @@ from tkamb.studies.uncertainty.bands import (
     influences,
     measured_inside,
     peak_band,
+    unbalanced_patella,
 )
 from tkamb.studies.uncertainty.inputs import VariedInput, held_inputs, uncertainty_of, varied_inputs
 from tkamb.studies.uncertainty.sample import BandWorker, Sample
@@ -321,6 +322,11 @@ class _Job:
         summary, weight = self.nominal.summary, self.case.body_weight
         bands |= discrepancy_columns(names, values, summary, weight)
         summary["uncertainty"] = self._summary(problems, tornado)
+        patella = self.case.scene.patella
+        if patella is not None and patella.motion == "recorded":
+            columns, words = unbalanced_patella(names, values, weight)
+            bands |= columns
+            summary["uncertainty"]["unbalanced_patella"] = words
         if PEAK in names:
             peak = peak_band(self.nominal[PEAK], values[:, names.index(PEAK)], failed)
             summary["uncertainty"]["peak_force_total_BW"] = peak
