@@ -340,7 +340,7 @@ def test_the_script_writes_the_scenes_that_are_shipped(tmp_path):
     from importlib.machinery import SourceFileLoader
     from importlib.util import module_from_spec, spec_from_loader
 
-    loader = SourceFileLoader("make_jw_scenes", str(ROOT / "scripts/make/jw_scenes"))
+    loader = SourceFileLoader("jw_scenes", str(ROOT / "scripts/make/jw_scenes"))
     script = module_from_spec(spec_from_loader("jw_scenes", loader))
     loader.exec_module(script)
     from tkamb.io.importing.patient import import_patient

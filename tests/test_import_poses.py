@@ -185,7 +185,7 @@ def test_a_mistake_is_one_line_and_nothing_is_written(bent_leg, block, tmp_path,
     "name", ["scene.toml", pytest.param("mirrored.toml", marks=pytest.mark.slow)]
 )
 def test_the_script_writes_dms_scenes_that_are_shipped(name):
-    loader = SourceFileLoader("make_dm_scenes", str(ROOT / "scripts/make/dm_scenes"))
+    loader = SourceFileLoader("dm_scenes", str(ROOT / "scripts/make/dm_scenes"))
     script = module_from_spec(spec_from_loader("dm_scenes", loader))
     loader.exec_module(script)
     patient = import_patient(script.request(DM, name), ROOT / "models/dm")
