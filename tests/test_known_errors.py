@@ -96,13 +96,15 @@ def test_contact_is_similar_so_that_pairs_scale_with_the_cells(model):
     assert large.medial.area == pytest.approx(4.0 * small.medial.area, rel=1e-3)
 
 
-@pytest.mark.parametrize("degrees", [3, 10])
-def test_the_sag_of_facets_is_that_of_chords(degrees):
-    turn = np.radians(degrees)
-    count = round(360 / degrees)
+@pytest.mark.parametrize("degrees", [3.0, 10.0])
+def test_the_sag_of_facets_is_that_of_chords_in_two_directions(degrees):
+    """Facets of t by t/2 on a ball; their sags add up at the middle of a facet."""
+    count = round(360.0 / degrees)
     ball = trimesh.creation.uv_sphere(radius=22e-3, count=[count // 2 + 1, count])
     surface = Surface(np.asarray(ball.vertices), np.asarray(ball.faces))
-    assert surface.facet_sag == pytest.approx(22e-3 * (1.0 - np.cos(turn / 2.0)), rel=0.05)
+    sag = sum(22e-3 * (1.0 - np.cos(np.radians(turn / 2.0))) for turn in (degrees, degrees / 2.0))
+    at_equator = surface.facet_sag(np.array([[0.0, -22e-3, 0.0]]), 6e-3)
+    assert at_equator == pytest.approx(sag, rel=0.12)
 
 
 def test_the_stated_error_covers_the_approach_on_coarse_facets():

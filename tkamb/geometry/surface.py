@@ -5,6 +5,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from tkamb.geometry.frames import MIRROR, Array, Index, Mask, pose, transform
 from tkamb.geometry.topology import Ragged, edge_use, same_places
@@ -239,28 +240,39 @@ class Surface:
         """The surface that this one was made of, and its affine map to here (4, 4)."""
         return None
 
-    @cached_property
-    def facet_sag(self) -> float:
-        """Sag, m, of the facets below the smooth surface: the largest but for a tenth of the edges.
+    def facet_sag(self, near: Array | None = None, radius: float = np.inf) -> float:
+        """Return the sag, m, of the facets' middles below the smooth surface.
 
-        Facets of width w that meet at an angle t are chords of a circle of radius w/t. Their sag is
-        w t/8. Edges of more than 30 deg, and those between coplanar facets, do not count.
+        Facets of width w that meet at an angle t are chords of a circle of radius w/t, with a sag
+        of w t/8. The sags of two directions add up: the result is twice the mean over the edges.
+        Edges of more than 30 deg, and those between coplanar facets, do not count.
+
+        Args:
+            near: (n, 3) m, points; only edges near one of them count. None: all edges.
+            radius: m, largest distance of such an edge's middle.
         """
+        middle, sag = self._edge_sags
+        if near is not None:
+            distance = cKDTree(near).query(middle, distance_upper_bound=radius)[0]
+            sag = sag[distance <= radius]
+        return 2.0 * float(sag.mean()) if len(sag) else 0.0
+
+    @cached_property
+    def _edge_sags(self) -> tuple[Array, Array]:
+        """Middles (m, 3), m, of the edges between curved facets, and the facets' sags (m,), m."""
         edge, count = edge_use(self.corner_vertices)
         face = np.repeat(np.arange(len(self.faces)), 3)
         order = np.argsort(edge, kind="stable")
-        first = np.cumsum(count) - count
-        twice = first[count == 2]
-        one, other = face[order[twice]], face[order[twice + 1]]
-        corners = self.triangles
-        lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).reshape(-1)
-        length = np.maximum(lengths[order[twice]], 1e-12)
+        first = (np.cumsum(count) - count)[count == 2]
+        one, other = face[order[first]], face[order[first + 1]]
+        ends = np.roll(self.triangles, -1, axis=1)
+        length = np.linalg.norm(ends - self.triangles, axis=2).reshape(-1)[order[first]]
+        middle = (0.5 * (ends + self.triangles)).reshape(-1, 3)[order[first]]
         cosine = np.einsum("ij,ij->i", self.face_normals[one], self.face_normals[other])
         turn = np.arccos(np.clip(cosine, -1.0, 1.0))
-        curved = (turn < SMOOTH_WITHIN) & (turn > NO_TURN)
-        width = (self.areas[one] + self.areas[other]) / length
-        sag = (width * turn / 8.0)[curved]
-        return float(np.quantile(sag, 0.9)) if len(sag) else 0.0
+        curved = (turn < SMOOTH_WITHIN) & (turn > NO_TURN) & (length > 0.0)
+        width = (self.areas[one] + self.areas[other])[curved] / length[curved]
+        return middle[curved], width * turn[curved] / 8.0
 
     @cached_property
     def volume(self) -> float:

@@ -113,7 +113,7 @@ def summary_of(
 
         material = given_material(scene.insert_material)
         chosen = material_as_json(material)
-        sag = sum(body.facet_sag for body in (case.femoral, case.insert) if body is not None)
+        sag = sum(body.facet_sag() for body in (case.femoral, case.insert) if body is not None)
         peak = ContactSituation.of_run(columns, columns["status"], material.poisson_ratio, sag)
         error = stated_error(table.model, table.resolution_mm, material.name, table.options, peak)
         summary["contact"] = table.model_dump(mode="json")
