@@ -175,6 +175,15 @@ def test_headline_numbers_equal_the_columns(bend, gait):
     assert f"{bend['force_total_N'].max():.0f} N" in shown["Peak resultant contact force"].detail
     peak = max(bend[f"{side}_peak_pressure_MPa"].max() for side in ("medial", "lateral"))
     assert shown["Peak contact pressure"].value == f"{peak:.1f} MPa"
+    bands = {
+        f"{side}_peak_pressure_MPa_{end}": factor * bend[f"{side}_peak_pressure_MPa"]
+        for side in ("medial", "lateral")
+        for end, factor in (("p05", 0.9), ("p50", 1.1), ("p95", 1.2))
+    }
+    made = cards(replace(bend, bands=bands), horizontal_axis(bend))
+    (card,) = (one for one in made if one.title == "Peak contact pressure")
+    assert card.value == f"{1.1 * peak:.1f} ({0.9 * peak:.1f}–{1.2 * peak:.1f}) MPa"
+    assert f"with the inputs as given it is {peak:.1f} MPa" in card.detail
     assert shown["Medial share of the load"].value == "50–58 %"
     assert shown["Frames computed"].value == "101 of 101"
     shown = {card.title: card for card in cards(gait, horizontal_axis(gait))}

@@ -199,3 +199,9 @@ def test_the_summary_compares_the_nominal_peak_with_the_samples(tmp_path):
     assert lines[0].startswith("peak forces: total ")
     assert "total: superior–inferior component" in lines[1]
     assert sum(line.startswith("peak of the resultant total force, at ") for line in lines) == 1
+    results = uncertainty.results
+    frame = int(np.nanargmax(results["quadriceps_N"]))
+    weight = results["force_total_N"][frame] / results["force_total_BW"][frame]
+    low, middle, high = results.band("quadriceps_N")[:, frame] / weight
+    expected = f"Peak quadriceps tension: {middle:.2f} ({low:.2f}–{high:.2f}) BW"
+    assert any(line.startswith(expected) for line in lines)

@@ -137,7 +137,7 @@ def headline(uncertainty: "Uncertainty") -> list[str]:
     """Return lines of text: the band of the peak force and the most influential inputs."""
     from numpy import isfinite, nanargmax
 
-    from tkamb.show.headline import limits_line, peak_lines
+    from tkamb.show.headline import extreme_lines, limits_line, peak_lines
 
     total = uncertainty.results["force_total_BW"]
     if not isfinite(total).any():
@@ -156,6 +156,7 @@ def headline(uncertainty: "Uncertainty") -> list[str]:
         )
     lines = peak_lines(uncertainty.results)
     lines += [f"peak of the resultant total force, at {flexion:.0f} deg: {value} ({words})"]
+    lines += extreme_lines(uncertainty.results)
     limits = limits_line(uncertainty.results)
     lines += [limits] if limits is not None else []
     chance_share = TERMS / uncertainty.results.summary["uncertainty"]["samples"]

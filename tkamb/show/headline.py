@@ -14,7 +14,7 @@ from tkamb.geometry.frames import SIDES, Array
 from tkamb.run import claims, metrics, texts
 from tkamb.run.known_errors import is_large, short_error_words
 from tkamb.run.status import AGREEMENT
-from tkamb.show.axis import HorizontalAxis
+from tkamb.show.axis import HorizontalAxis, horizontal_axis
 
 if TYPE_CHECKING:
     from tkamb.run.results import Results
@@ -166,6 +166,13 @@ def peak_lines(results: "Results") -> list[str]:
     )
 
 
+def extreme_lines(results: "Results") -> list[str]:
+    """Return a line of text for the peaks of pressure and of quadriceps tension."""
+    titles = ("Peak contact pressure", "Peak quadriceps tension")
+    made = cards(results, horizontal_axis(results))
+    return [one.line() for one in made if one.title in titles]
+
+
 def limits_line(results: "Results") -> str | None:
     """Return a line on the hip's reserve moments and the saturated muscles, or None."""
     facts = _muscles(results.summary)
@@ -205,6 +212,15 @@ def _band(results: "Results") -> dict[str, Any] | None:
         "many_failed": table["largest_failed_share"] > HEADLINE.notable_failed_share,
         "not_varied": ", ".join(name.replace("_", " ") for name in table["not_varied"]),
     }
+
+
+def _with_band(results: "Results", name: str, frame: int, scale: float, digits: int) -> str:
+    """Return median and 5 to 95 % of a column at a frame in words, or its nominal value."""
+    band = results.band(name)
+    if band is None or not np.isfinite(band[:, frame]).all():
+        return f"{scale * results[name][frame]:.{digits}f}"
+    low, middle, high = (f"{scale * end:.{digits}f}" for end in band[:, frame])
+    return f"{middle} ({low}–{high})"
 
 
 def _largest(table: Mapping[str, Any], result: str) -> str:
@@ -263,6 +279,7 @@ def _peak_pressure(results: "Results") -> dict[str, Any] | None:
     above = {side: metrics.peak(results, f"{side}_area_above_yield") for side in sides}
     return {
         "peak": peak,
+        "value": _with_band(results, f"{peak.side}_peak_pressure_MPa", peak.frame, 1.0, 1),
         "doubt": doubt,
         "yield_stress": results.summary.get("yield_stress_MPa"),
         "above": {side: one.value for side, one in above.items() if one is not None},
@@ -291,6 +308,9 @@ def _extensor(results: "Results") -> dict[str, Any] | None:
     known = slope is not None and np.isfinite(slope[peak.frame]) and peak.value > 0
     return {
         "peak": peak,
+        "value": _with_band(
+            results, "quadriceps_N", peak.frame, 1.0 / metrics.body_weight(results), 2
+        ),
         "ligament": _range(metrics.tension_ratio(results, "patellar_ligament_N"), "", 2),
         "patella": _range(metrics.tension_ratio(results, "patellofemoral_N"), "", 2),
         "wraps": wraps,
