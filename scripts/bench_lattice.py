@@ -31,7 +31,7 @@ from tkamb.contact.registry import contact_model
 def measure(case, data, name, resolution, load, repeats):
     """Return the row of one case, model and resolution."""
     pair, at = contact_pair(case, data, "polyethylene")
-    model = contact_model(name, resolution, cache=False)
+    model = contact_model(name, resolution=resolution * 1e-3, cache=False)
     begun = time.perf_counter()
     state = model.prepare(pair)
     prepare = time.perf_counter() - begun

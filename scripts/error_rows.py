@@ -91,7 +91,9 @@ def solved_key(case: ErrorCase, material: str, contact: str, resolution_mm: floa
 def solve(case: ErrorCase, material: str, contact: str, resolution_mm: float) -> dict[str, Any]:
     """Return status, flags and quantities of a press."""
     keeps = "cache" in getattr(contact_class(contact), "__dataclass_fields__", {})
-    model = contact_model(contact, resolution_mm, **({"cache": False} if keeps else {}))
+    model = contact_model(
+        contact, resolution=resolution_mm * 1e-3, **({"cache": False} if keeps else {})
+    )
     result = model.press(model.prepare(case.pair(material)), case.load, case.pose)
     return {"status": result.status.value, "flags": list(result.flags), **quantities(result)}
 

@@ -67,7 +67,7 @@ def measure(job):
         answer = press_by_calculix(case.pair, case.load, case.pose, job["resolution_mm"], element)
         took = (answer.prepare_seconds, answer.run.seconds, answer.run.seconds)
         return took_row(job, answer.nodes, *took, answer.run.peak_rss_MB) | found(answer.result)
-    model = contact_model(job["model"], job["resolution_mm"], cache=False)
+    model = contact_model(job["model"], resolution=job["resolution_mm"] * 1e-3, cache=False)
     prepare, state = timed(model.prepare, case.pair)
     cold, (result, start) = timed(model.press_from, state, case.load, case.pose)
     warm = []

@@ -6,6 +6,7 @@ from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
 from tkamb.contact.materials import material
 from tkamb.contact.pair import ContactPair
 from tkamb.geometry.frames import KNEE_COORDINATES
+from tkamb.knee.ligament_laws import StackedLaws, TwoLine
 from tkamb.knee.ligaments import BundleArrays
 from tkamb.knee.released import released_indices
 from tkamb.knee.released_forces import SCALE, JointEquilibrium, ReleasedForces, unit_residual
@@ -37,9 +38,7 @@ def bundles(ends=(), stiffness=1e5):
     femur = np.array([femoral for femoral, _, _ in ends], float).reshape(-1, 3)
     shank = np.array([tibial for _, tibial, _ in ends], float).reshape(-1, 3)
     slack = np.array([length for _, _, length in ends], float)
-    return BundleArrays(
-        femur, shank, np.ones(len(ends), bool), np.full(len(ends), stiffness), slack
-    )
+    return BundleArrays(femur, shank, StackedLaws.of([TwoLine(stiffness)] * len(ends)), slack)
 
 
 def joint_equations(external, released=ALL, ligaments=None):

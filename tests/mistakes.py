@@ -112,7 +112,7 @@ class Bench:
         case = load_case(load_scene(scene))
         contact = case.scene.contact
         if contact is not None:  # contact is not computed, but its settings are checked
-            contact_model(contact.model, contact.resolution_mm, **contact.options)
+            contact_model(contact.model, resolution=contact.resolution_mm * 1e-3, **contact.options)
             material(contact.material)
         mechanics = mechanics_of(case)
         plausibility = Plausibility(case, mechanics)

@@ -232,7 +232,7 @@ def share_of_load(design: RandomInsert, contact: str = "lattice-linear") -> floa
     vertices[:, 2] = np.where(vertices[:, 2] < 0, vertices[:, 2], np.abs(vertices[:, 2]))
     femoral = Surface(vertices, np.asarray(spheres.faces, np.int64), "femoral", merged=True)
     pair = ContactPair(femoral, insert, material("polyethylene"))
-    model = contact_model(contact, max(1e3 * design.size, 1.5), cache=False)
+    model = contact_model(contact, resolution=max(1e3 * design.size, 1.5) * 1e-3, cache=False)
     result = model.press(model.prepare(pair), 1000.0, np.eye(4))
     if result.status is not ContactStatus.OK:
         return None

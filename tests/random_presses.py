@@ -19,7 +19,7 @@ STARTS = ("cold", "warm", "heavier", "wrong pose")
 def prepared(mm, tolerance=1e-3):
     """Return the lattice with a cell size (mm), and its state for condyles on a dished insert."""
     bodies = pair(condyles(subdivisions=4), dished_insert(cells=24), material("polyethylene"))
-    model = contact_model("lattice", mm, tolerance=tolerance)
+    model = contact_model("lattice", resolution=mm * 1e-3, tolerance=tolerance)
     return model, model.prepare(bodies)
 
 

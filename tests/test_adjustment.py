@@ -155,7 +155,7 @@ def test_a_femur_far_from_the_insert_is_an_input_error(query: ClosestPointQuery)
 
 @cache
 def prepared(query: ClosestPointQuery) -> tuple[ContactModel, Any]:
-    model = contact_model("foundation", 1.0)
+    model = contact_model("foundation", resolution=1e-3)
     return model, model.prepare(ContactPair(query.femoral, query.insert, material("polyethylene")))
 
 

@@ -56,7 +56,7 @@ def test_split_sensitivity_of_two_spheres_has_its_closed_form(name):
     """
     power, load = {"foundation-linear": (2.0, 1000.0), "lattice-linear": (1.5, 1000.0)}[name]
     pair = flat_joint()
-    model = contact_model(name, 1.0)
+    model = contact_model(name, resolution=1e-3)
     state = model.prepare(pair)
     result = model.press(state, load, knee_pose(np.zeros(6)))
     expected = power * (load / 2) / result.approach * HALF
@@ -65,7 +65,7 @@ def test_split_sensitivity_of_two_spheres_has_its_closed_form(name):
 
 def test_split_tangent_of_a_layer_under_two_spheres_has_its_closed_form():
     """The tangent jumps when columns come into contact, by less with finer columns."""
-    model, load = contact_model("foundation-linear", 0.25), 1000.0
+    model, load = contact_model("foundation-linear", resolution=0.25e-3), 1000.0
     state = model.prepare(flat_joint())
     result = model.press(state, load, knee_pose(np.zeros(6)))
     expected = 2.0 * (load / 2) / result.approach * HALF
@@ -74,7 +74,7 @@ def test_split_tangent_of_a_layer_under_two_spheres_has_its_closed_form():
 
 def test_a_probe_of_a_result_equals_a_probe_at_its_pose():
     """To the bit, also after an evaluation at another pose."""
-    model = contact_model("foundation", 1.0)
+    model = contact_model("foundation", resolution=1e-3)
     state = model.prepare(flat_joint())
     result = model.press(state, 1000.0, knee_pose(np.zeros(6)))
     far_pose = result.pose.copy()
@@ -89,10 +89,10 @@ def test_a_probe_of_a_result_equals_a_probe_at_its_pose():
 
 
 def test_a_probe_of_a_failed_result_evaluates_all_columns():
-    model = contact_model("foundation", 1.0)
+    model = contact_model("foundation", resolution=1e-3)
     state = model.prepare(flat_joint())
     pose = model.press(state, 1000.0, knee_pose(np.zeros(6))).pose
-    failed = ContactResult.failed(state, pose, "no result")
+    failed = ContactResult.out_of_range(state, pose, "no result")
     assert set(model.probe(state).seen(failed).condyles) == {"medial", "lateral"}
 
 

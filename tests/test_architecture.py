@@ -1,6 +1,8 @@
-"""Layers of the package: a folder imports only from lower folders."""
+"""Layers of the package: a folder imports only from lower folders, also by `import_module`."""
 
 import ast
+import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -9,15 +11,20 @@ PACKAGE = Path(__file__).parents[1] / "tkamb"
 
 ORDER = ("geometry", "contact", "knee", "io", "run", "studies", "show", "commands")
 """Folders from the lowest to the highest. Each imports only from lower ones and itself."""
-SERVES_ALL = {"errors", "files", "units"}
+SERVES_ALL = {"errors", "files", "settings", "units"}
 """Modules that every folder may import."""
-ON_TOP = {"__init__", "__main__", "cli", "crocoddyl", "moved", "testing"}
+ON_TOP = {"__init__", "__main__", "cli", "crocoddyl", "testing"}
 """Modules that may import every folder."""
 
 
 def imported(path):
-    """Return the tkamb modules that a file imports, except for type checking."""
-    names, tree = set(), ast.parse(path.read_text(encoding="utf-8"))
+    """Return the tkamb modules that a file imports, except for type checking.
+
+    A text "tkamb.module:Name", or a text that is the name of a module in a file that uses
+    `import_module`, counts as an import of the module.
+    """
+    text = path.read_text(encoding="utf-8")
+    names, tree, by_name = set(), ast.parse(text), "import_module" in text
     typing = {
         inner
         for node in ast.walk(tree)
@@ -31,7 +38,15 @@ def imported(path):
             names.update(f"{node.module}.{alias.name}" for alias in node.names)
         elif isinstance(node, ast.Import):
             names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            names.update(named_module(node.value, by_name))
     return {name for name in names if name.startswith("tkamb")}
+
+
+def named_module(text, by_name):
+    """Return the module that a text names: {"tkamb.a.b"} for "tkamb.a.b:Name"."""
+    match = re.fullmatch(r"(tkamb(?:\.\w+)+)(:\w+)?", text)
+    return {match[1]} if match and (match[2] or by_name) else set()
 
 
 def part_of(name):
@@ -65,6 +80,58 @@ def test_imported_modules_are_found():
     names = imported(PACKAGE / "run" / "mechanics.py")
     assert "tkamb.knee.instant" in names
     assert part_of("tkamb.knee.instant") == "knee"
+    assert "tkamb.contact.hertz" in imported(PACKAGE / "contact" / "registry.py")
+
+
+def test_an_import_by_name_is_found(tmp_path):
+    (tmp_path / "low.py").write_text('import_module("tkamb.show.plots").plot()')
+    assert imported(tmp_path / "low.py") == {"tkamb.show.plots"}
+    (tmp_path / "low.py").write_text('PAGES = {"plots": "tkamb.show.plots:plot"}')
+    assert imported(tmp_path / "low.py") == {"tkamb.show.plots"}
+
+
+@pytest.mark.parametrize("folder", ORDER[:-1])
+def test_modules_are_imported_by_a_computed_name_only_in_the_registry(folder):
+    """`NamedClasses` gets its names from tables of texts, which `imported` reads."""
+    users = {
+        path.name
+        for path in (PACKAGE / folder).rglob("*.py")
+        if re.search(r"import_module\((?!\")", path.read_text(encoding="utf-8"))
+    }
+    assert users <= {"named_classes.py"}
+
+
+@cache
+def names_in(module):
+    """Return the names at the top of a module, and its submodules; None: no module of tkamb."""
+    path = PACKAGE.parent.joinpath(*module.split("."))
+    file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    if not file.exists():
+        return None
+    names = {inner.stem for inner in path.iterdir()} if path.is_dir() else set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            names.update(alias.asname or alias.name for alias in node.names)
+        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names.add(node.name)
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            names.add(node.id)
+    return names
+
+
+def test_scripts_import_names_that_exist():
+    """A script that no test runs would break unseen if a name of the package changes."""
+    scripts = (path for path in (PACKAGE.parent / "scripts").rglob("*") if path.is_file())
+    texts = {path: path.read_bytes() for path in scripts if path.suffix in ("", ".py")}
+    python = {path: text for path, text in texts.items() if path.suffix or b"python" in text[:40]}
+    assert len(python) > 50
+    for path, text in python.items():
+        for node in ast.walk(ast.parse(text)):
+            module = getattr(node, "module", None) or ""
+            if module.startswith("tkamb.") and isinstance(node, ast.ImportFrom):
+                names, missing = names_in(module), {alias.name for alias in node.names}
+                assert names is not None, f"{path.name} imports {module}"
+                assert missing <= names, f"{path.name} imports {missing - names} from {module}"
 
 
 def test_physics_does_not_import_scenes_or_files():
@@ -105,6 +172,7 @@ def cycles(graph):
 def test_imports_have_no_cycle():
     files = {module_name(path): path for path in PACKAGE.rglob("*.py")}
     graph = {name: imported(path) & set(files) for name, path in files.items()}
+    graph["tkamb"] = set()  # offers the names of all folders, each imported at its first use
     assert graph["tkamb.run.simulation"]
     assert cycles(graph) == []
 

@@ -34,7 +34,9 @@ def with_eminence():
 
 
 def flags(insert, x, z, model="foundation-linear", radius=20 * MM, load=150.0):
-    chosen = contact_model(model, 1.0, **({"cache": False} if model.startswith("lat") else {}))
+    chosen = contact_model(
+        model, resolution=1e-3, **({"cache": False} if model.startswith("lat") else {})
+    )
     pair = ContactPair(graded_sphere(radius), insert, LINEAR)
     result = chosen.press(chosen.prepare(pair), load, pose(np.eye(3), [x, 0, z]))
     return [flag for flag in result.flags if "edge of the insert" in flag]

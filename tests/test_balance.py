@@ -436,7 +436,7 @@ def test_the_work_of_the_foundation_on_a_closed_path_is_small(dished):
     ],
 )
 def test_every_contact_model_reaches_equilibrium(name, resolution_mm):
-    model = contact_model(name, resolution_mm)
+    model = contact_model(name, resolution=resolution_mm * 1e-3)
     state = model.prepare(dished_joint())
     external = push([20.0, LOAD, 0], [0, 0, 2e-3])
     start = [0.3e-3, TOUCH, -0.3e-3, 0.01, 0, 0.3]

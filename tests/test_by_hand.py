@@ -15,7 +15,7 @@ from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.knee.contact_points import CondylePoint
 from tkamb.knee.equations import EQUATION, solve_knee
-from tkamb.knee.ligaments import quadratic_toe_force, two_line_force
+from tkamb.knee.ligament_laws import QuadraticToe, TwoLine
 from tkamb.knee.unknowns import residuals
 from tkamb.run.read_scene import mechanics_of
 
@@ -128,16 +128,16 @@ def test_columns_of_area_and_pressure_have_the_units_of_their_names(results, sid
 
 def test_bundles_follow_the_published_toe_law():
     """Blankevoort et al. 1991, eps1 = 0.03: both branches give k eps1 at 6 %, a quarter at 3 %."""
-    assert quadratic_toe_force(1.06, 1.0, 2000.0) == pytest.approx(60.0)
-    assert quadratic_toe_force(1.03, 1.0, 2000.0) == pytest.approx(15.0)
-    assert quadratic_toe_force(1.10, 1.0, 2000.0) == pytest.approx(140.0)
-    assert two_line_force(0.10 * 1.10, 0.10, 5e4) == pytest.approx(5e4 * 0.10 * 0.07)
+    assert QuadraticToe(2000.0).tension(1.06, 1.0) == pytest.approx(60.0)
+    assert QuadraticToe(2000.0).tension(1.03, 1.0) == pytest.approx(15.0)
+    assert QuadraticToe(2000.0).tension(1.10, 1.0) == pytest.approx(140.0)
+    assert TwoLine(5e4).tension(0.10 * 1.10, 0.10) == pytest.approx(5e4 * 0.10 * 0.07)
 
 
 def test_the_source_s_rule_divides_by_the_overlap_of_the_undeformed_bodies():
     """A sphere that penetrates the flat insert by d has the contact area pi (2 R d - d²)."""
     radius, load = 20e-3, 700.0
-    model = contact_model("lattice-linear", 1.0, pressure_rule="source", cache=False)
+    model = contact_model("lattice-linear", resolution=1e-3, pressure_rule="source", cache=False)
     bodies = pair(
         sphere_cap(radius), box_insert(20e-3, 8e-3, 20e-3), material("polyethylene-linear")
     )

@@ -86,7 +86,7 @@ def cylinder_on_post(model, law=LINEAR, size_mm=1.0, radius=RADIUS):
     ahead = np.array([4 * radius, 0.0, 0.0])
     flange = Surface(np.asarray(front.vertices) + ahead, np.asarray(front.faces, np.int64))
     body = joined(cylinder(radius, 1.2 * LENGTH), flange)
-    return CamPost(contact_model(model, size_mm), body, post, 0.0, law)
+    return CamPost(contact_model(model, resolution=size_mm * 1e-3), body, post, 0.0, law)
 
 
 def pressed_in(overlap, radius=RADIUS):
@@ -121,7 +121,7 @@ def test_the_division_does_not_change_the_contact_of_the_condyles(
     changes.
     """
     dishes, post = parts
-    chosen, pose = contact_model(model, size_mm), place(40.0, -5.4, 3.0)
+    chosen, pose = contact_model(model, resolution=size_mm * 1e-3), place(40.0, -5.4, 3.0)
     pose[1, 3] -= 0.25e-3
     wrenches = []
     for body in (insert, dishes):

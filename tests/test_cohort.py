@@ -260,13 +260,12 @@ def test_a_folder_in_use_or_of_another_cohort_is_refused(file, tmp_path, capsys)
 @pytest.mark.slow
 def test_a_full_disk_leaves_all_files_or_none(file, tmp_path, monkeypatch):
     cohort, outcomes = load_cohort(file), {n: outcome(1.0, 5) for n in range(4)}
-    monkeypatch.setattr("tkamb.show.cohort_report.cohort_html", lambda *_: "page")
 
     def write(folder, number=None):
         folder.mkdir()
         injected = Faults(folder, number).injected(monkeypatch)
         with claimed_directory(folder), injected as faults, suppress(InputError):
-            write_cohort(cohort, outcomes, {}, folder)
+            write_cohort(cohort, outcomes, {}, folder, report=lambda *_: "page")
         settle(folder)
         return faults.calls, WRITTEN & {path.name for path in folder.iterdir()}
 

@@ -51,12 +51,12 @@ def plugin(monkeypatch):
 @pytest.mark.parametrize("name", sorted(BUILT_IN))
 def test_built_in_models_conform(name):
     fine = name in ("hertz", "foundation", "foundation-linear")
-    check_contact_model(contact_model(name, 1.0 if fine else COARSE))
+    check_contact_model(contact_model(name, resolution=(1.0 if fine else COARSE) * 1e-3))
 
 
 def test_a_model_of_another_package_is_found_and_conforms(plugin):
     assert "winkler" in contact_names()
-    model = contact_model("winkler", 1.0, modulus=1e11)
+    model = contact_model("winkler", resolution=1e-3, modulus=1e11)
     assert type(model).__module__ == "tkamb_winkler.model"
     assert model.modulus == 1e11
     check_contact_model(model)
@@ -110,12 +110,12 @@ def test_an_entry_point_that_is_not_a_model_is_an_input_error(value, monkeypatch
 @pytest.mark.parametrize("resolution", [0.0, -1.0, float("nan"), float("inf")])
 def test_resolution_must_be_a_length(resolution):
     with pytest.raises(InputError, match="resolution"):
-        contact_model("foundation", resolution)
+        contact_model("foundation", resolution=resolution * 1e-3)
 
 
 def test_an_unknown_option_is_named():
     with pytest.raises(InputError, match=r"no option 'stiffness'.*law"):
-        contact_model("foundation", 1.0, stiffness=1.0)
+        contact_model("foundation", resolution=1e-3, stiffness=1.0)
 
 
 @dataclass(frozen=True)
@@ -184,8 +184,10 @@ def test_the_conformance_test_detects_a_faulty_model(model, requirement):
 
 
 def test_models_with_equal_options_are_equal():
-    assert contact_model("foundation", 1.5) == contact_model("foundation", 1.5)
-    assert contact_model("foundation", 1.5).resolution == pytest.approx(1.5e-3)
+    assert contact_model("foundation", resolution=1.5e-3) == contact_model(
+        "foundation", resolution=1.5e-3
+    )
+    assert contact_model("foundation", resolution=1.5e-3).resolution == pytest.approx(1.5e-3)
     assert np.isclose(contact_model("hertz").resolution, 1e-3)
 
 
@@ -230,7 +232,7 @@ def test_an_error_of_a_plug_in_names_the_plug_in(plugin, tmp_path, monkeypatch, 
 
 def test_code_of_tkamb_is_not_foreign(plugin):
     assert foreign_code(contact_model("foundation")) is None
-    winkler = contact_model("winkler", 1.0, modulus=1e11)
+    winkler = contact_model("winkler", resolution=1e-3, modulus=1e11)
     assert foreign_code(winkler) == contact_code("winkler") != contact_code("foundation")
 
 

@@ -21,7 +21,7 @@ POLYETHYLENE = material("polyethylene")
 
 def pressed(name, femoral, insert, load, pose=None, size=2.0):
     """Return the result of a press, and the prepared state."""
-    model = contact_model(name, size)
+    model = contact_model(name, resolution=size * 1e-3)
     state = model.prepare(ContactPair(femoral, insert, POLYETHYLENE))
     return model.press(state, load, above() if pose is None else pose), state
 

@@ -127,7 +127,7 @@ def test_a_larger_size_follows_the_scaling_law():
     )
     pose = pressed.pose("medial", 0.0, case)
     pose[:3, 3] *= size
-    model = contact_model("lattice", 4.0 * size, cache=False)
+    model = contact_model("lattice", resolution=4.0 * size * 1e-3, cache=False)
     state = model.prepare(replace(pair, femoral=femoral, insert=insert))
     direct = model.press(state, load, pose).medial
     assert scaled.area == pytest.approx(direct.area, rel=0.01)

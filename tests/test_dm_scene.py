@@ -18,7 +18,8 @@ from tkamb.io.recordings.tables import read_table
 from tkamb.io.recordings.tibia import load_tibia
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import Case, load_case
-from tkamb.knee.ligaments import build_ligaments, quadratic_toe_force
+from tkamb.knee.ligament_laws import QuadraticToe
+from tkamb.knee.ligaments import build_ligaments
 from tkamb.run.plausibility.movement import marker_questions
 
 ROOT = Path(__file__).parents[1]
@@ -197,7 +198,7 @@ def test_ligament_law_is_that_of_opensim():
     strain = np.linspace(-0.02, 0.12, 141)
     toe, line = 0.5 * strain**2 / 0.06, strain - 0.5 * 0.06
     expected = 4000 * np.where(strain <= 0, 0, np.where(strain <= 0.06, toe, line))
-    np.testing.assert_allclose(quadratic_toe_force(1 + strain, 1.0, 4000), expected, atol=1e-9)
+    np.testing.assert_allclose(QuadraticToe(4000).tension(1 + strain, 1.0), expected, atol=1e-9)
 
 
 def test_ligaments_are_near_their_slack_length_in_stance():

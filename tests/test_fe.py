@@ -37,7 +37,7 @@ def test_lattice_and_finite_elements_agree_on_two_condyles(law):
     bodies = pair(condyles(subdivisions=5), dished_insert(), material(law))
     result = []
     for name in ("lattice", "fe"):
-        model = contact_model(name, 2.0)
+        model = contact_model(name, resolution=2e-3)
         result.append(model.press(model.prepare(bodies), 1500.0, knee_pose(np.zeros(6))))
     lattice, fe = result
     assert lattice.approach == pytest.approx(fe.approach, rel=0.04)
@@ -53,7 +53,7 @@ def test_lattice_and_finite_elements_converge_to_each_other():
     for size in (2.5, 1.25):
         approaches = []
         for name in ("lattice", "fe"):
-            model = contact_model(name, size)
+            model = contact_model(name, resolution=size * 1e-3)
             state = model.prepare(bodies)
             approaches.append(model.press(state, 1500.0, knee_pose(np.zeros(6))).approach)
         differences.append(abs(approaches[0] / approaches[1] - 1))

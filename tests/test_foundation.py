@@ -13,6 +13,7 @@ from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
 from tkamb.contact import samples as contact_samples
 from tkamb.contact.foundation import (
     OVER_THE_EDGE,
+    TOO_DEEP,
     ElasticFoundation,
     LinearFoundation,
     layer_pressure,
@@ -238,14 +239,16 @@ def test_out_of_range_is_nan_with_a_reason():
     model = ElasticFoundation(1e-3)
     state = model.prepare(sphere_on_block(material("polyethylene")))
     deep = model.evaluate(state, lowered(6e-3))
-    assert deep.status is ContactStatus.OUT_OF_RANGE
+    assert deep.failed is True and deep.status is ContactStatus.OUT_OF_RANGE
+    assert deep.reason == f"{TOO_DEEP}: 6.00 mm deep, at most 5.00 mm"
+    assert model.evaluate(state, lowered(1e-4)).failed is False
     assert np.isnan(deep.pressure).all()
     overloaded = model.press(state, 1e7, lowered(0))
     assert overloaded.status is ContactStatus.OUT_OF_RANGE
     assert "half the insert's thickness" in " ".join(overloaded.flags)
     beside = model.press(state, 100.0, lowered(0, x=60e-3))
     assert beside.status is ContactStatus.OUT_OF_RANGE
-    assert "does not lie over the insert" in beside.flags[0]
+    assert "does not lie over the insert, but 15.0 mm beside it" in beside.reason
     assert beside.medial is None
 
 
@@ -286,7 +289,8 @@ def test_the_femur_over_an_edge_has_its_own_message():
         return model.evaluate(state, pose(np.eye(3), [0, 17e-3 + z, z] + (6e-3 - depth) * out))
 
     assert at(0.5e-3, 10e-3).status is at(0.05e-3, 14.5e-3).status is ContactStatus.OK
-    assert at(0.5e-3, 14.5e-3).flags == (OVER_THE_EDGE,)
+    (flag,) = at(0.5e-3, 14.5e-3).flags
+    assert flag.startswith(f"{OVER_THE_EDGE}: ") and " mm deep, at most " in flag
 
 
 @pytest.mark.parametrize("share", [0.5, 0.999, 1.05, 3.0])

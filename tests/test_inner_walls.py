@@ -75,7 +75,7 @@ def peak(insert, contact):
     ball = trimesh.creation.icosphere(4, 0.022)
     femoral = Surface(np.asarray(ball.vertices), np.asarray(ball.faces, np.int64), "femoral")
     pair = ContactPair(femoral, insert, material("polyethylene"))
-    model = contact_model(contact, 2.0)
+    model = contact_model(contact, resolution=2e-3)
     return model.press(model.prepare(pair), 500.0, np.eye(4)).pressure.max()
 
 

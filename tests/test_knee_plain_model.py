@@ -106,7 +106,7 @@ def test_equilibrium_moves_the_knee_of_a_model_without_a_patella(read):
     knee = without_patella(read[0])
     q, v, a, external = state_of(read, 60)
     equilibrium = knee.equilibrium(q, v, a, external)
-    assert not equilibrium.problem
+    assert not equilibrium.failed
     assert knee.coordinates(equilibrium.q) == pytest.approx(equilibrium.coordinates, abs=1e-10)
     assert equilibrium.q[:7] == pytest.approx(q[:7])
     forces = knee.external_forces(equilibrium.q, v, equilibrium.loads.tensions)
@@ -132,5 +132,13 @@ def test_show_draws_below_the_users_own_node(read, left):
     paths = {command.path.lower() for command in sent}
     for part in ("femoral", "insert", "patella", "pressure", "force/medial/0", "extensor"):
         assert any(f"mine/knee/{part}" in path for path in paths), part
+    # At the first look the insert is upright in the middle of the window; later calls move nothing.
+    (view,) = [c.matrix for c in sent if c.path.lower() == "/meshcat"]
+    insert = pin.XYZQUATToSE3(q[:7]).homogeneous @ knee.bridge.insert.placement.homogeneous
+    assert (view @ insert)[:3, 1] == pytest.approx([0.0, 0.0, 1.0], abs=1e-9)
+    assert np.abs((view @ insert)[:3, 3]).max() < 0.03
+    sent.clear()
+    knee.show(viewer, q)
+    assert not any(command.path.lower() == "/meshcat" for command in sent)
     with pytest.raises(tkamb.errors.InputError, match="MeshCat"):
         knee.show(object(), q)

@@ -25,7 +25,7 @@ OFFSETS = [(0, 0), (0.5, 0.5), (0.5, 0), (0.25, 0.25), (0.13, 0.37), (0.4, 0.1),
 
 def hertz_errors(width, height, size, offsets):
     """Return relative L2 and peak errors of the pressure, one row per sub-cell offset."""
-    model = contact_model("lattice-linear", size * 1e3)
+    model = contact_model("lattice-linear", resolution=size * 1e3 * 1e-3)
     state = model.prepare(pair(sphere_cap(RADIUS), box_insert(width, height, width), LINEAR))
     a, _, middles, exact = sphere_on_layer(RADIUS, height, 500.0, E, NU)
     rows = []
@@ -71,7 +71,7 @@ def test_plate_on_box_agrees_with_finite_elements():
     """1000 N on 12 x 12 x 3 mm at 1 mm: largest and smallest pressures agree within 2 %."""
     results = {}
     for name in ("lattice-linear", "fe"):
-        model = contact_model(name, 1.0)
+        model = contact_model(name, resolution=1e-3)
         state = model.prepare(pair(plate(20e-3, 20e-3), box_insert(12e-3, 3e-3, 12e-3), LINEAR))
         results[name] = model.press(state, 1000.0, above())
     lattice, fe = results["lattice-linear"], results["fe"]
@@ -86,7 +86,7 @@ def test_plate_approach_converges_with_the_cells():
     sizes, approaches = np.array([1.5, 1.0, 0.75]), []
     insert = box_insert(12e-3, 3e-3, 12e-3)
     for size in sizes:
-        model = contact_model("lattice-linear", size)
+        model = contact_model("lattice-linear", resolution=size * 1e-3)
         state = model.prepare(pair(plate(20e-3, 20e-3), insert, LINEAR))
         approaches.append(model.press(state, 1000.0, above()).approach)
     error = 0.0257e-3 - np.array(approaches)
@@ -99,10 +99,12 @@ def test_accelerated_iteration_agrees_with_newton(name, load):
     """Approach, peak and condyle forces are within 1 % of full Newton with a small tolerance."""
     femoral, insert = condyles(subdivisions=4), dished_insert(cells=24)
     pose = knee_pose([1e-3, 0.0, 0.3e-3, 0.0, np.radians(0.3), 0.0])
-    model = contact_model(name, 3.0)
+    model = contact_model(name, resolution=3e-3)
     state = model.prepare(pair(femoral, insert, POLYETHYLENE))
     fast = model.press(state, load, pose)
-    exact = contact_model(name, 3.0, newton=True, tolerance=1e-5).press(state, load, pose)
+    exact = contact_model(name, resolution=3e-3, newton=True, tolerance=1e-5).press(
+        state, load, pose
+    )
     assert fast.status is exact.status is ContactStatus.OK
     assert fast.approach == pytest.approx(exact.approach, rel=0.01)
     assert fast.pressure.max() == pytest.approx(exact.pressure.max(), rel=0.01)
@@ -121,7 +123,7 @@ def test_a_contact_with_too_few_candidates_is_solved_again(name, monkeypatch):
         return initial_guess(*arguments)
 
     monkeypatch.setattr(lattice_model, "initial_guess", counting)
-    model = contact_model(name, 2.0)
+    model = contact_model(name, resolution=2e-3)
     state = model.prepare(pair(condyles(subdivisions=4), dished_insert(cells=24), POLYETHYLENE))
     pose = knee_pose([1e-3, 0.0, 0.3e-3, 0.0, 0.0, 0.0])
 
@@ -143,7 +145,7 @@ def test_a_contact_with_too_few_candidates_is_solved_again(name, monkeypatch):
 
 def test_candidates_are_added_before_newton_s_method_is_tried(monkeypatch):
     """The result is then that of a cold start."""
-    model = contact_model("lattice", 2.0)
+    model = contact_model("lattice", resolution=2e-3)
     state = model.prepare(pair(condyles(subdivisions=4), dished_insert(cells=24), POLYETHYLENE))
     pose = knee_pose([1e-3, 0.0, 0.3e-3, 0.0, 0.0, 0.0])
     cold, heavy = model.press_from(state, 4000.0, pose)
@@ -174,7 +176,7 @@ def test_active_nodes_end_on_the_femoral_surface():
     """New rays give gaps within four tolerances, on a rough femoral component."""
     label = "load_N=20000.0, rough_mm=0.01"
     rough = next(x for x in extremes() if (x.model, x.label) == ("lattice", label))
-    model = contact_model("lattice", rough.resolution_mm)
+    model = contact_model("lattice", resolution=rough.resolution_mm * 1e-3)
     state = model.prepare(rough.pair)
     result, start = model.press_from(state, 15e3, rough.pose)
     assert result.status is ContactStatus.OK
@@ -189,7 +191,7 @@ def test_the_work_tolerance_keeps_heavy_loads_accurate(monkeypatch):
     """Approach and peak from cold and warm starts, compared with a tolerance of 1e-5."""
     bodies = pair(condyles(subdivisions=4), dished_insert(cells=24), POLYETHYLENE)
     pose = knee_pose([1e-3, 0.0, 0.3e-3, 0.0, 0.0, 0.0])
-    model, fine = (contact_model("lattice", 2.0, tolerance=x) for x in (1e-3, 1e-5))
+    model, fine = (contact_model("lattice", resolution=2e-3, tolerance=x) for x in (1e-3, 1e-5))
     state, exact = model.prepare(bodies), fine.prepare(bodies)
     expected = {load: fine.press(exact, load, pose) for load in (8e3, 16e3)}
     starts = {load: model.press_from(state, load, pose)[1] for load in (800.0, 15e3)}
@@ -225,7 +227,7 @@ def test_newton_s_method_follows_unbalanced_forces_but_not_gaps(cause, monkeypat
         monkeypatch.setattr(solver.SlidingNodes, "_relative_gap", large_gap)
     else:
         monkeypatch.setattr(nonlinear_balance.NonlinearBalance, "advance", lambda self: None)
-    model = contact_model("lattice", 3.0)
+    model = contact_model("lattice", resolution=3e-3)
     state = model.prepare(pair(condyles(subdivisions=4), dished_insert(cells=24), POLYETHYLENE))
     result = model.press(state, 800.0, knee_pose([1e-3, 0.0, 0.3e-3, 0.0, 0.0, 0.0]))
     if cause == "surface":
@@ -238,7 +240,7 @@ def test_newton_s_method_follows_unbalanced_forces_but_not_gaps(cause, monkeypat
 
 @pytest.mark.parametrize("bearing", ["fixed", "mobile"])
 def test_condyles_share_the_load_of_a_symmetric_press(bearing):
-    model = contact_model("lattice", 2.0)
+    model = contact_model("lattice", resolution=2e-3)
     state = model.prepare(
         pair(condyles(subdivisions=4), dished_insert(cells=24), POLYETHYLENE, bearing)
     )
@@ -250,7 +252,7 @@ def test_condyles_share_the_load_of_a_symmetric_press(bearing):
 
 def test_forces_act_along_the_femoral_normal():
     """On a sphere, every force points away from the centre."""
-    model = contact_model("lattice", 2.0)
+    model = contact_model("lattice", resolution=2e-3)
     state = model.prepare(pair(sphere_cap(RADIUS), box_insert(20e-3, 8e-3, 20e-3), POLYETHYLENE))
     result = model.press(state, 800.0, above(0.7e-3, -0.4e-3))
     loaded = result.pressure > 0
@@ -265,7 +267,7 @@ def test_forces_act_along_the_femoral_normal():
 @pytest.mark.parametrize("nu", [0.0, 0.4999])
 @pytest.mark.parametrize("load", [1e-3, 1.0, 1e3, 1e4])
 def test_extreme_loads_and_poisson_ratios_give_a_result_or_a_flag(name, nu, load):
-    model = contact_model(name, 3.0)
+    model = contact_model(name, resolution=3e-3)
     mat = material("polyethylene", poisson_ratio=nu)
     state = model.prepare(pair(condyles(subdivisions=4), dished_insert(cells=24), mat))
     result = model.press(state, load, knee_pose([0, 0, 0, 0, np.radians(5), 0]))
@@ -277,7 +279,7 @@ def test_extreme_loads_and_poisson_ratios_give_a_result_or_a_flag(name, nu, load
 
 
 def test_thirty_kilonewtons_are_flagged_or_out_of_range():
-    model = contact_model("lattice", 3.0)
+    model = contact_model("lattice", resolution=3e-3)
     state = model.prepare(pair(condyles(subdivisions=4), dished_insert(cells=24), POLYETHYLENE))
     result = model.press(state, 3e4, knee_pose(np.zeros(6)))
     assert result.status is ContactStatus.OUT_OF_RANGE or any("strain" in f for f in result.flags)
@@ -287,7 +289,9 @@ def test_source_loops_agree_with_the_default_solver():
     for law in ("linear", "nonlinear"):
         results = []
         for loops in ("stored", "source"):
-            model = contact_model("lattice-source", 2.0, law=law, loops=loops, tolerance=1e-4)
+            model = contact_model(
+                "lattice-source", resolution=2e-3, law=law, loops=loops, tolerance=1e-4
+            )
             bodies = pair(sphere_cap(RADIUS), box_insert(14e-3, 6e-3, 14e-3), POLYETHYLENE)
             results.append(model.press(model.prepare(bodies), 800.0, above()))
         stored, source = results
@@ -298,7 +302,7 @@ def test_source_loops_agree_with_the_default_solver():
 
 def test_source_pressure_rule_shares_the_overlap_evenly():
     """Nodes in contact have equal areas. The sum of p A is the load."""
-    model = contact_model("lattice-linear", 1.5, pressure_rule="source")
+    model = contact_model("lattice-linear", resolution=1.5e-3, pressure_rule="source")
     bodies = pair(sphere_cap(RADIUS), box_insert(20e-3, 8e-3, 20e-3), LINEAR)
     result = model.press(model.prepare(bodies), 500.0, above())
     loaded = result.pressure > 0

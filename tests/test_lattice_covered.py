@@ -62,7 +62,7 @@ def test_exact_nodal_values_give_the_area_of_the_circle():
 def test_the_contact_area_of_a_sphere_is_accurate(size, worst, nu):
     """500 N. The sum of tributary areas would be 20 and 40 % too large."""
     body = replace(LINEAR, poisson_ratio=nu)
-    model = contact_model("lattice-linear", size)
+    model = contact_model("lattice-linear", resolution=size * 1e-3)
     state = model.prepare(pair(sphere_cap(RADIUS), box_insert(16e-3, 8e-3, 16e-3), body))
     a, *_ = sphere_on_layer(RADIUS, 8e-3, 500.0, body.young_modulus, nu)
     result = [model.press(state, 500.0, above(*(np.array(o) * size * 1e-3))) for o in OFFSETS]
@@ -80,7 +80,7 @@ def test_the_contact_area_of_a_sphere_is_accurate(size, worst, nu):
 @pytest.mark.parametrize("load", [1e-3, 1.0, 50.0])
 def test_the_mean_pressure_is_never_above_the_peak(name, load):
     """The contact is smaller than a cell, so that its area cannot be resolved."""
-    model = contact_model(name, 2.0)
+    model = contact_model(name, resolution=2e-3)
     state = model.prepare(
         pair(sphere_cap(RADIUS), box_insert(16e-3, 8e-3, 16e-3), material("polyethylene"))
     )
@@ -91,14 +91,14 @@ def test_the_mean_pressure_is_never_above_the_peak(name, load):
 
 def test_the_contact_of_a_sharp_punch_ends_half_way_between_nodes():
     """A punch of 8 x 8 mm with edges between the nodes; the gap jumps at the edge."""
-    model = contact_model("lattice-linear", 1.0)
+    model = contact_model("lattice-linear", resolution=1e-3)
     state = model.prepare(pair(plate(8e-3, 8e-3), box_insert(16e-3, 6e-3, 16e-3), LINEAR))
     result = model.press(state, 500.0, above(0.5e-3, 0.5e-3))
     assert result.medial.area == pytest.approx(64e-6, rel=0.02)
 
 
 def test_contact_up_to_the_rim_has_the_whole_area():
-    model = contact_model("lattice-linear", 1.0)
+    model = contact_model("lattice-linear", resolution=1e-3)
     state = model.prepare(pair(plate(20e-3, 20e-3), box_insert(12e-3, 3e-3, 12e-3), LINEAR))
     assert model.press(state, 1000.0, above()).medial.area == pytest.approx(144e-6, rel=1e-9)
 
@@ -117,7 +117,7 @@ def narrow(result):
     ],
 )
 def test_a_contact_is_flagged_as_narrow_or_has_an_accurate_peak(name, size):
-    model = contact_model(name, size)
+    model = contact_model(name, resolution=size * 1e-3)
     state = model.prepare(pair(sphere_cap(RADIUS), box_insert(16e-3, 8e-3, 16e-3), LINEAR))
     peaks = []
     for load in (1.0, 50.0, 200.0, 300.0, 500.0, 3000.0):
@@ -137,7 +137,7 @@ def test_a_line_contact_is_flagged_at_any_length():
     body.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
     cylinder = Surface(np.array(body.vertices), np.array(body.faces, np.int64), "cylinder")
     insert = box_insert(16e-3, 6e-3, 12e-3)
-    coarse, fine = (contact_model("lattice-linear", size) for size in (1.0, 0.5))
+    coarse, fine = (contact_model("lattice-linear", resolution=size * 1e-3) for size in (1.0, 0.5))
     state, exact = (model.prepare(pair(cylinder, insert, LINEAR)) for model in (coarse, fine))
     for load, z in ((150.0, 0.0), (150.0, 0.5e-3), (1500.0, 0.0), (3000.0, 0.5e-3)):
         result = coarse.press(state, load, above(0, z))

@@ -25,9 +25,9 @@ def punch(radius=6e-3, fillet=0.5e-3):
 
 def pressed(model, femoral, size_mm):
     bodies = pair(femoral, box_insert(16e-3, 8e-3, 16e-3), material("polyethylene-linear"))
-    state = contact_model(model, size_mm, cache=False).prepare(bodies)
+    state = contact_model(model, resolution=size_mm * 1e-3, cache=False).prepare(bodies)
     start = above(y=10e-3 - femoral.bounds[0, 1])
-    return contact_model(model, size_mm, cache=False).press(state, 500.0, start)
+    return contact_model(model, resolution=size_mm * 1e-3, cache=False).press(state, 500.0, start)
 
 
 @pytest.mark.parametrize("model", MODELS)

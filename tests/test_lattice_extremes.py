@@ -67,12 +67,12 @@ def prepared(shape, nu=None):
     femoral, insert, pose, size = SHAPES[shape]
     changes = {} if nu is None else {"poisson_ratio": nu}
     bodies = pair(femoral, insert(), material("polyethylene", **changes))
-    return contact_model("lattice", size).prepare(bodies), pose, size
+    return contact_model("lattice", resolution=size * 1e-3).prepare(bodies), pose, size
 
 
 def by_newton(state, load, pose, size):
     """Return the result of the reference Newton's method; None if it fails."""
-    model = contact_model("lattice", size, newton=True, tolerance=5e-4)
+    model = contact_model("lattice", resolution=size * 1e-3, newton=True, tolerance=5e-4)
     try:
         result = model.press(state, load, pose)
     except ComputationError:
@@ -82,7 +82,7 @@ def by_newton(state, load, pose, size):
 
 def compare(state, pose, size, load):
     """Return the lattice's result after a comparison with the reference Newton's method."""
-    quick = contact_model("lattice", size).press(state, load, pose)
+    quick = contact_model("lattice", resolution=size * 1e-3).press(state, load, pose)
     exact = by_newton(state, load, pose, size)
     if quick.status is not ContactStatus.OK:
         assert quick.flags
@@ -115,12 +115,15 @@ def test_extreme_poisson_ratios_agree_with_newton_or_fail(nu, load):
 def test_presses_of_one_kilonewton_converge(shape):
     """All shapes converge but the block of 6 mm, with a strain below -1."""
     state, pose, size = prepared(shape)
-    assert contact_model("lattice", size).press(state, 1e3, pose).status is ContactStatus.OK
+    assert (
+        contact_model("lattice", resolution=size * 1e-3).press(state, 1e3, pose).status
+        is ContactStatus.OK
+    )
 
 
 def test_a_completely_compressed_insert_gives_no_numbers():
     state, pose, size = prepared("two millimetres")
-    result = contact_model("lattice", size).press(state, 1e4, pose)
+    result = contact_model("lattice", resolution=size * 1e-3).press(state, 1e4, pose)
     assert result.status is ContactStatus.OUT_OF_RANGE
     assert "compressed to nothing" in " ".join(result.flags)
     assert np.isnan(result.approach)
@@ -129,6 +132,6 @@ def test_a_completely_compressed_insert_gives_no_numbers():
 
 def test_an_insert_with_a_post_is_pressed_beside_the_post():
     state, pose, size = prepared("post")
-    result = contact_model("lattice", size).press(state, 1e3, pose)
+    result = contact_model("lattice", resolution=size * 1e-3).press(state, 1e3, pose)
     loaded = result.points[result.pressure > 0]
     assert (np.abs(loaded[:, 2]) > 3e-3).all()

@@ -33,7 +33,7 @@ def shipped():
 @lru_cache
 def prepared(name):
     """Return a model with cells of 2 mm, prepared for the shipped knee."""
-    model = contact_model(name, 2.0)
+    model = contact_model(name, resolution=2e-3)
     return model, model.prepare(shipped()[0])
 
 

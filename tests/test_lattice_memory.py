@@ -66,16 +66,16 @@ def test_the_proposed_resolution_fits_into_the_memory(monkeypatch, available):
     monkeypatch.setattr(operator, "available_memory", lambda: available)
     size = 0.5 if available > 1e8 else 1.0
     with pytest.raises(InputError, match=r"GB are left; take .* mm or coarser") as error:
-        contact_model("lattice-linear", size, cache=False).prepare(bodies)
+        contact_model("lattice-linear", resolution=size * 1e-3, cache=False).prepare(bodies)
     proposal = float(re.search(r"take ([\d.]+) mm", str(error.value))[1])
-    contact_model("lattice-linear", proposal, cache=False).prepare(bodies)
+    contact_model("lattice-linear", resolution=proposal * 1e-3, cache=False).prepare(bodies)
 
 
 def test_without_memory_no_resolution_is_proposed(monkeypatch):
     bodies = pair(sphere_cap(22e-3), box_insert(0.02, 0.01, 0.02), LINEAR)
     monkeypatch.setattr(operator, "available_memory", lambda: 1e3)
     with pytest.raises(InputError, match="free some memory"):
-        contact_model("lattice-linear", 2.0, cache=False).prepare(bodies)
+        contact_model("lattice-linear", resolution=2e-3, cache=False).prepare(bodies)
 
 
 def test_available_memory_is_the_smallest_of_three_limits(tmp_path, monkeypatch):

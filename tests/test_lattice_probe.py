@@ -18,7 +18,7 @@ LEVER = 0.02
 @lru_cache
 def prepared(name):
     """Return a model with cells of 2 mm and a small tolerance, for two spheres in a dish."""
-    model = replace(contact_model(name, 2.0), tolerance=1e-6)
+    model = replace(contact_model(name, resolution=2e-3), tolerance=1e-6)
     bodies = pair(condyles(), dished_insert(), material("polyethylene"))
     return model, model.prepare(bodies)
 
@@ -80,7 +80,7 @@ def test_a_light_contact_does_not_depend_on_a_heavy_one_before(name, depth):
 @pytest.fixture(scope="module")
 def usual():
     """Return a model with the default tolerance, and two spheres in a dish under 2.5 kN."""
-    model = contact_model("lattice", 1.5)
+    model = contact_model("lattice", resolution=1.5e-3)
     bodies = pair(condyles(), dished_insert(), material("polyethylene"))
     state = model.prepare(bodies)
     return model, state, model.press(state, 2500.0, above(y=0.03)).pose

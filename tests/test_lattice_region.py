@@ -24,7 +24,7 @@ LOAD = 2500.0
 
 @pytest.fixture(scope="module", params=["lattice", "fe", "lattice-source"])
 def model(request):
-    return contact_model(request.param, 2.0)
+    return contact_model(request.param, resolution=2e-3)
 
 
 @pytest.fixture(scope="module")
@@ -135,12 +135,12 @@ def test_the_approach_is_that_of_the_pose(state):
     assert result.approach == 0.0
     deeper = replace(result, pose=state.pair.pose_at_approach(POSE, 2e-4))
     assert deeper.approach == pytest.approx(2e-4, abs=1e-15)
-    assert np.isnan(ContactResult.failed(state, POSE, "why").approach)
+    assert np.isnan(ContactResult.out_of_range(state, POSE, "why").approach)
 
 
 def test_stored_compliance_changes_no_result(state):
     """A cache filled at other poses and an empty one give results that differ by rounding only."""
-    model = contact_model("lattice", 2.0)
+    model = contact_model("lattice", resolution=2e-3)
     for x in (4e-3, -3e-3):
         pose = POSE.copy()
         pose[0, 3] += x
@@ -183,7 +183,7 @@ def test_the_stored_compliance_can_grow_in_any_order(state, monkeypatch):
 
 
 def test_a_warm_start_of_another_insert_is_not_used(state):
-    model = contact_model("lattice", 2.0)
+    model = contact_model("lattice", resolution=2e-3)
     other = replace(state, problem=replace(state.problem))
     result, start = model.press_from(other, LOAD, POSE)
     assert isinstance(start, LatticeStart)

@@ -34,7 +34,7 @@ def coarse():
 @pytest.mark.parametrize("name", ["lattice", "fe"])
 def test_the_reported_residual_equals_an_independent_measurement(name, load, monkeypatch):
     """Without a guess and after a heavier load; equal to 1e-6 of the load."""
-    model = contact_model(name, 3.0)
+    model = contact_model(name, resolution=3e-3)
     bodies = pair(condyles(subdivisions=4), dished_insert(cells=24), material("polyethylene"))
     state, solutions = model.prepare(bodies), []
 

@@ -67,7 +67,7 @@ def loads(insert, contact, size=2.0, bearing="fixed"):
     spheres = trimesh.util.concatenate(balls)
     femoral = Surface(np.asarray(spheres.vertices), np.asarray(spheres.faces, np.int64), "femoral")
     pair = ContactPair(femoral, insert, material("polyethylene-linear"), bearing)
-    model = contact_model(contact, size)
+    model = contact_model(contact, resolution=size * 1e-3)
     result = model.press(model.prepare(pair), LOAD, np.eye(4))
     return result.medial.force, result.lateral.force
 

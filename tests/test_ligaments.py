@@ -1,10 +1,12 @@
 """Ligament laws, slack lengths from a reference strain, and equal and opposite forces."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from pydantic import ValidationError
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import inverse, knee_pose
@@ -13,18 +15,24 @@ from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.io.scene.parts import ligament
 from tkamb.io.scene.tables import LigamentTable
+from tkamb.knee.ligament_laws import (
+    LIGAMENT_LAW,
+    LigamentLaw,
+    QuadraticToe,
+    StackedLaws,
+    TwoLine,
+    law_name,
+    ligament_law,
+)
 from tkamb.knee.ligaments import (
-    LIGAMENT,
     Ligament,
     build_ligaments,
     condylar_axis,
     generic_ligaments,
     ligament_loads,
-    quadratic_toe_force,
     strain_table,
-    two_line_force,
 )
-from tkamb.knee.load import total_wrench
+from tkamb.knee.load import LinkPoint, total_wrench
 
 SLACK = 0.05
 FLEXION = np.deg2rad(np.arange(0.0, 101.0, 5.0))
@@ -48,30 +56,85 @@ def bundle_of(**changes: object) -> Ligament:
 
 @pytest.mark.parametrize(
     ("law", "stiffness", "terminal"),
-    [(two_line_force, 9e4, 9e4 * SLACK), (quadratic_toe_force, 2750.0, 2750.0)],
+    [(TwoLine, 9e4, 9e4 * SLACK), (QuadraticToe, 2750.0, 2750.0)],
 )
-def test_laws(law: object, stiffness: float, terminal: float) -> None:
+def test_laws(law: type, stiffness: float, terminal: float) -> None:
     """A slack ligament has no tension. Both branches meet at twice the toe strain."""
     strain = np.array(
         [
             -0.5,
             0.0,
-            2 * LIGAMENT.toe_strain * (1 - 1e-12),
-            2 * LIGAMENT.toe_strain * (1 + 1e-12),
+            2 * LIGAMENT_LAW.toe_strain * (1 - 1e-12),
+            2 * LIGAMENT_LAW.toe_strain * (1 + 1e-12),
             0.1,
         ]
     )
-    force = law(SLACK * (1 + strain), SLACK, stiffness)
+    lengths = SLACK * (1 + strain)
+    force = law(stiffness).tension(lengths, SLACK)
     assert force[0] == 0.0
     assert force[1] == 0.0
     assert force[2] == pytest.approx(force[3], rel=1e-9)
-    assert force[2] == pytest.approx(terminal * LIGAMENT.toe_strain)
-    assert (force[4] - force[3]) / (0.1 - 2 * LIGAMENT.toe_strain) == pytest.approx(terminal)
+    assert force[2] == pytest.approx(terminal * LIGAMENT_LAW.toe_strain)
+    assert (force[4] - force[3]) / (0.1 - 2 * LIGAMENT_LAW.toe_strain) == pytest.approx(terminal)
+
+
+@dataclass(frozen=True)
+class Cubic(LigamentLaw):
+    """A law of another package."""
+
+    unit = "N per strain"
+    words, source = "F = k eps^3", "a test"
+    offset: float = 0.0
+
+    def tension(self, length, slack_length):
+        return self.stiffness * np.maximum(np.asarray(length) / slack_length - 1.0, 0.0) ** 3
+
+    def slope(self, length, slack_length):
+        strain = np.maximum(np.asarray(length) / slack_length - 1.0, 0.0)
+        return 3.0 * self.stiffness * strain**2 / slack_length
+
+
+LAWS = [TwoLine(9e4), Cubic(5e5), QuadraticToe(2750.0), TwoLine(4e4), Cubic(2e5, 1.0)]
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_the_slope_of_a_law_is_the_derivative_of_its_tension(law: LigamentLaw) -> None:
+    lengths, h = SLACK * (1 + np.array([-0.1, 0.01, 0.05, 0.07, 0.2])), 1e-8
+    slope = (law.tension(lengths + h, SLACK) - law.tension(lengths - h, SLACK)) / (2 * h)
+    np.testing.assert_allclose(law.slope(lengths, SLACK), slope, rtol=1e-5)
+    # A larger knee of the same tissue: size squared times the tension at the same strain.
+    larger = law.scaled(1.2).tension(1.2 * lengths, 1.2 * SLACK)
+    np.testing.assert_allclose(larger, 1.44 * law.tension(lengths, SLACK), rtol=1e-12)
+
+
+def test_laws_together_are_those_of_each_bundle() -> None:
+    slack = SLACK * np.linspace(0.9, 1.1, len(LAWS))
+    length = slack * np.array([[1.05], [1.10]])
+    stacked = StackedLaws.of(LAWS)
+    for name in ("tension", "slope"):
+        single = [getattr(law, name)(length[:, k], slack[k]) for k, law in enumerate(LAWS)]
+        np.testing.assert_array_equal(getattr(stacked, name)(length, slack), np.array(single).T)
+
+
+def test_laws_are_found_by_name_and_impossible_numbers_are_refused() -> None:
+    assert ligament_law("two-line", 9e4) == TwoLine(stiffness=9e4)
+    assert law_name(QuadraticToe(1.0)) == "quadratic-toe" and law_name(Cubic(1.0)) == "Cubic"
+    with pytest.raises(InputError, match=r"no ligament law 'two-lines'; did you mean two-line\?"):
+        ligament_law("two-lines", 9e4)
+    with pytest.raises(InputError, match=r"stiffness -3.0; give .* above 0, in N/m"):
+        TwoLine(-3.0)
+    ends = LinkPoint("femur", np.zeros(3)), LinkPoint("tibia", np.ones(3))
+    with pytest.raises(InputError, match=r"'linear' is no law; .*two-line, quadratic-toe"):
+        Ligament("MCL", *ends, "linear")
+    with pytest.raises(InputError, match=r"TwoLine\(stiffness=...\), stiffness in N/m"):
+        Ligament("MCL", *ends, "two-line")
+    with pytest.raises(ValidationError, match="no ligament law 'linear'"):
+        bundle_of(law="linear")
 
 
 def test_quadratic_toe_has_no_kink() -> None:
-    e, h = 2 * LIGAMENT.toe_strain, 1e-7
-    f = quadratic_toe_force(SLACK * (1 + np.array([e - h, e, e + h])), SLACK, 1.0)
+    e, h = 2 * LIGAMENT_LAW.toe_strain, 1e-7
+    f = QuadraticToe(1.0).tension(SLACK * (1 + np.array([e - h, e, e + h])), SLACK)
     assert (f[1] - f[0]) / h == pytest.approx((f[2] - f[1]) / h, rel=1e-4)
 
 

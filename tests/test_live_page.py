@@ -17,7 +17,7 @@ IDLE = "tkamb.bench && !tkamb.bench.busy && !tkamb.bench.waiting"
 def page(chromium, tmp_path_factory):
     changes = {"contact.model": "foundation", "contact.resolution_mm": 3.0}
     knee, motion, _ = tkamb.read_scene(tkamb.load_scene(MODEL / "scene.toml", changes))
-    server = knee.live(motion.q[60], load=800.0, folder=tmp_path_factory.mktemp("kept"))
+    server = tkamb.live(knee, motion.q[60], load=800.0, folder=tmp_path_factory.mktemp("kept"))
     page = Page(chromium).open(server.url)
     page.wait(f"{IDLE} && tkamb.bench.reference")
     yield page

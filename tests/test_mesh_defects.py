@@ -21,7 +21,7 @@ MODELS = ("foundation", "foundation-linear", "hertz", "lattice-linear")
 
 def flags(femoral, insert, model="foundation", load=1000.0):
     """Return the flags of a press as one text."""
-    contact = contact_model(model, 1.5)
+    contact = contact_model(model, resolution=1.5e-3)
     pair = ContactPair(femoral, insert, material("polyethylene"))
     return "; ".join(contact.press(contact.prepare(pair), load, above()).flags)
 

@@ -80,7 +80,9 @@ def pressures(outline, cover, name, size):
     insert = extruded(outline)
     assert insert.mesh.volume > 0
     pair = ContactPair(cover, insert, LINEAR, "mobile")
-    model = contact_model(name, size, **({} if name == "foundation-linear" else {"cache": False}))
+    model = contact_model(
+        name, resolution=size * 1e-3, **({} if name == "foundation-linear" else {"cache": False})
+    )
     result = model.press(model.prepare(pair), 1500.0, np.eye(4))
     return result, 1500.0 / (area_of(outline) * MM**2)
 

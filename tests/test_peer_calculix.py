@@ -131,7 +131,7 @@ def test_linear_lattice_and_fe_agree_with_calculix(load, varus):
     pair, pose = two_condyles(LINEAR), knee_pose([0, 0, 0, 0, np.radians(varus), 0])
     peer = press_by_calculix(pair, load, pose, 2.0).result
     for name, approach, peak in (("lattice", 0.02, 0.04), ("fe", 0.015, 0.02)):
-        model = contact_model(name, 2.0)
+        model = contact_model(name, resolution=2e-3)
         result = model.press(model.prepare(pair), load, pose)
         assert result.approach == pytest.approx(peer.approach, rel=approach)
         assert result.pressure.max() == pytest.approx(peer.pressure.max(), rel=peak)
@@ -146,7 +146,7 @@ def test_linear_lattice_and_fe_agree_with_calculix(load, varus):
 def test_small_strain_agrees_with_finite_strain_of_calculix(varus):
     pair, pose = two_condyles(NONLINEAR), knee_pose([0, 0, 0, 0, np.radians(varus), 0])
     peer = press_by_calculix(pair, 2000.0, pose, 2.0).result
-    model = contact_model("lattice", 2.0)
+    model = contact_model("lattice", resolution=2e-3)
     result = model.press(model.prepare(pair), 2000.0, pose)
     assert result.approach == pytest.approx(peer.approach, rel=0.05)
     assert result.pressure.max() == pytest.approx(peer.pressure.max(), rel=0.05)

@@ -79,7 +79,7 @@ def test_the_time_series_for_paraview_has_a_file_for_each_map(tmp_path, capsys):
     ("arguments", "words"),
     [
         (["--vtp"], "--vtp: needs --out"),
-        (["--sto", "a.sto", "--out", "b"], "--out: needs --vtp or --deck"),
+        (["--sto", "a.sto", "--out", "b"], "--out: needs --vtp or --figures or --deck"),
         (["--deck", "ccx", "--out", "a.inp"], "--deck: needs --frame"),
         (["--deck", "ccx", "--frame", "0", "--out", "a.feb"], "is not a .inp file"),
     ],
@@ -95,7 +95,7 @@ def test_titles_legends_and_plots_do_not_overlap():
     measured = {
         f"measured_{name}_N": RUN["force_total_N"] for name in ("total", "medial", "lateral")
     }
-    figure = type(RUN)(RUN.columns | measured, RUN.summary).plot()
+    figure = tkamb.plot(type(RUN)(RUN.columns | measured, RUN.summary))
     figure.draw_without_rendering()
     boxes = [
         part.get_window_extent()

@@ -6,7 +6,8 @@ from importlib import import_module
 from types import ModuleType
 
 from tkamb.cli import main
-from tkamb.run.settings import PACKAGE, all_settings, changed_settings, field_docstrings
+from tkamb.commands.settings import PACKAGE, all_settings, field_docstrings
+from tkamb.settings import changed_settings
 
 
 def settings_classes():

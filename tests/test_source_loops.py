@@ -31,7 +31,9 @@ def bodies():
 @pytest.fixture(scope="module")
 def prepared(bodies):
     """Return the model at 2 mm and its prepared state, with a factor in single precision."""
-    model = contact_model("lattice-source", 2.0, loops="source", tolerance=1e-4, cache=False)
+    model = contact_model(
+        "lattice-source", resolution=2e-3, loops="source", tolerance=1e-4, cache=False
+    )
     return model, model.prepare(bodies)
 
 
@@ -119,7 +121,7 @@ def test_a_press_factorises_nothing(prepared, monkeypatch):
 
 @pytest.mark.parametrize("law", ["linear", "nonlinear"])
 def test_where_the_loops_begin_changes_no_answer(bodies, monkeypatch, law):
-    model = contact_model("lattice-source", 2.0, loops="source", law=law, cache=False)
+    model = contact_model("lattice-source", resolution=2e-3, loops="source", law=law, cache=False)
     state, results = model.prepare(bodies), []
     for first in (0.4, 0.8, 1.0):
         solve = partial(loops.solve_by_loops, settings=LoopSettings(first_depth=first))

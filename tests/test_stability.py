@@ -98,7 +98,7 @@ def test_an_impossible_material_is_flagged():
     (np.nan, (), "unflagged_wrong"),
 ])  # fmt: skip
 def test_a_wrong_result_without_a_flag_is_unflagged_wrong(share, flags, kind):
-    model = contact_model("foundation", 3.0)
+    model = contact_model("foundation", resolution=3e-3)
     result = model.press(model.prepare(SMALL.pair), 100.0, SMALL.pose)
     assert result.status is ContactStatus.OK
     pose = SMALL.pair.pose_at_approach(result.pose, share * result.approach)

@@ -135,4 +135,4 @@ def test_a_result_that_contradicts_its_load_fails_a_check(changed, word):
 def model_of(extreme):
     from tkamb.contact.registry import contact_model
 
-    return contact_model(extreme.model, extreme.resolution_mm, cache=False)
+    return contact_model(extreme.model, resolution=extreme.resolution_mm * 1e-3, cache=False)

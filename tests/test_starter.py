@@ -89,4 +89,4 @@ def test_a_recording_of_one_row_is_named(tmp_path, capfd):
     motion = scene.parent / "motion.csv"
     motion.write_text("".join(motion.read_text().splitlines(True)[:2]))
     assert main(["run", str(scene), "--out", str(tmp_path / "out")]) == 2
-    assert "holds 1 row of motion" in capfd.readouterr().err
+    assert "has one row, at 1.2 s" in capfd.readouterr().err

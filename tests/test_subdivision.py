@@ -106,7 +106,7 @@ def test_subdivision_does_not_change_the_approach_of_a_sphere(cut):
     for times in (0, 1):
         femoral = halved(ball(), times if cut == "femoral" else 0)
         insert = halved(dish, times if cut == "insert" else 0)
-        model = contact_model("lattice-linear", 2.0)
+        model = contact_model("lattice-linear", resolution=2e-3)
         state = model.prepare(ContactPair(femoral, insert, LINEAR))
         result.append(model.press(state, 800.0, above(0.3e-3, 0.2e-3)))
     before, after = result
@@ -118,7 +118,7 @@ def test_subdivision_does_not_change_the_approach_of_a_sphere(cut):
 def test_subdivision_does_not_change_the_approach_of_the_shipped_condyles():
     case = load_case(load_scene(MODEL / "scene.toml"))
     pose = knee_pose(case.motion.coordinates[36])
-    model, result = contact_model("lattice", 3.0), []
+    model, result = contact_model("lattice", resolution=3e-3), []
     for times in (0, 1):
         femoral, insert = halved(case.femoral, times), halved(case.insert, times)
         state = model.prepare(ContactPair(femoral, insert, material("polyethylene")))

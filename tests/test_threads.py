@@ -95,7 +95,7 @@ def test_a_press_does_not_depend_on_the_number_of_threads(with_threads, name):
     result = []
     for count in (1, 2):
         with_threads(count)
-        model = contact_model(name, 2.0)
+        model = contact_model(name, resolution=2e-3)
         result.append(model.press(model.prepare(bodies), 2000.0, pose))
     single, double = result
     assert single.status is double.status is ContactStatus.OK

@@ -141,7 +141,7 @@ def test_two_families_of_grids_have_a_common_limit():
 
 def test_equal_results_have_no_error():
     case = study_case("sphere")
-    model = contact_model("foundation", 2.0)
+    model = contact_model("foundation", resolution=2e-3)
     result = model.press(model.prepare(case.pair), case.load, case.pose)
     values, raster = quantities(result), raster_map(result)
     assert set(errors(values, values).values()) == {0.0}

@@ -1,10 +1,13 @@
 """Printed peak of an uncertain run, varied tendon bands, and a patella without equilibrium."""
 
+import csv
+import tomllib
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from mirrored_patient import write_mirrored_patient
 from scenes import write_scene
 from tkamb.commands.uncertainty import headline
 from tkamb.io.scene import load_scene
@@ -17,7 +20,8 @@ from tkamb.show.headline import cards
 from tkamb.studies.uncertainty.bands import band_columns, peak_band
 from tkamb.studies.uncertainty.inputs import Draw, VariedInput, varied_inputs
 from tkamb.studies.uncertainty.run import estimate_uncertainty
-from tkamb.studies.uncertainty.sample import varied_case
+from tkamb.studies.uncertainty.sample import Sampler, varied_case
+from tkamb.studies.uncertainty.sampling import Point
 
 NOMINAL = np.array([1.0, 3.39, 2.0])
 
@@ -112,6 +116,77 @@ def test_a_recorded_patella_without_equilibrium_is_flagged(tmp_path, band, flagg
     assert (across > 100).all() == flagged
     for status in run.status:
         assert ("recorded patella is not in equilibrium with its lines" in status) == flagged
+
+
+MOVED = ("flexion", "tuberosity.ap", "tuberosity.si", "muscle_attachment.quadriceps.insertion.ap")
+MOVED += ("muscle_attachment.quadriceps.origin.si", "tendon_band.quadriceps")
+FORCES = ("quadriceps_N", "patellofemoral_N", "patellar_ligament_N", "force_total_N")
+
+
+def without_contact(path, changes):
+    """Return the scene without contact model, with 11 frames and changed keys."""
+    scene = load_scene(path, {"motion.frames": 11} | changes)
+    return scene.model_copy(update={"contact": None})
+
+
+def changed_scene(path, values):
+    """Return the scene with errors of the inputs `MOVED` (deg, mm), and a solved patella."""
+    flexion, forwards, upwards, insertion, origin, band = values
+    motion = path.with_name("changed.csv")
+    head, *rows = list(csv.reader(path.with_name("motion.csv").read_text().splitlines()))
+    at = head.index("flexion_deg")
+    for row in rows:
+        row[at] = repr(float(row[at]) + flexion)
+    motion.write_text("\n".join(map(",".join, [head, *rows])))
+    scene = tomllib.loads(path.read_text())
+    line, muscle = scene["patellar_ligament"]["distal"], scene["quadriceps"]
+    line["point_mm"] = list(np.add(line["point_mm"], [forwards, upwards, 0.0]))
+    for end, shift in (("insertion", [insertion, 0, 0]), ("origin", [0, origin, 0])):
+        muscle[end]["point_mm"] = list(np.add(muscle[end]["point_mm"], shift))
+    changes = {
+        "motion.file": motion.name,
+        "patellar_ligament.distal": line,
+        "quadriceps.insertion": muscle["insertion"],
+        "quadriceps.origin": muscle["origin"],
+        "quadriceps.band_mm": 5.0 + band,
+    }
+    return without_contact(path, changes | {"patella.motion": "solved"})
+
+
+@pytest.mark.parametrize(
+    ("motion", "side"), [("recorded", "right"), ("recorded", "left"), ("solved", "right")]
+)
+def test_samples_of_the_patella_equal_runs_of_changed_scenes(tmp_path, monkeypatch, motion, side):
+    """A recorded patella follows its lines: the forces change as those of a solved one."""
+    writer = write_scene if side == "right" else write_mirrored_patient
+    path = writer(tmp_path)
+    scene = without_contact(path, {"patella.motion": motion})
+    sampler = Sampler(scene, range(5, 11, 5), FORCES)
+    inputs = tuple(VariedInput(name, 1.0, "deg" if name == "flexion" else "mm") for name in MOVED)
+
+    def sample(values):
+        frames = len(sampler.case.motion.time)
+        draw = Draw(inputs, np.array(values), np.zeros((frames, 1)), 1.0)
+        monkeypatch.setattr(sampler, "draw", lambda point: draw)
+        return sampler(0, None).values
+
+    def run(values):
+        results = simulate(changed_scene(path, values), frames=slice(5, 11, 5))
+        return np.array([results[name] for name in FORCES])
+
+    nothing, errors = [0.0] * 6, [0.8, 2.0, -3.0, 3.0, 4.0, 2.0]
+    change, expected = sample(errors) - sample(nothing), run(errors) - run(nothing)
+    assert np.abs(expected).max() > 100.0
+    np.testing.assert_allclose(change, expected, atol=2.0)
+
+
+def test_a_recorded_patella_has_no_band_where_it_has_no_equilibrium(tmp_path):
+    """The change of an equilibrium that does not exist is unknown."""
+    path = write_scene(tmp_path, patellar_ligament__length_mm=120.0)
+    sampler = Sampler(without_contact(path, {}), range(5, 6), FORCES)
+    sample = sampler(0, Point.of(0, np.zeros(len(sampler.inputs))))
+    assert sample.problems[0].startswith("patella lost at ")
+    assert np.isnan(sample.values).all()
 
 
 def test_the_summary_compares_the_nominal_peak_with_the_samples(tmp_path):

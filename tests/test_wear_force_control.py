@@ -58,7 +58,7 @@ def machine(applied, free, springs=None):
 
 def equilibrium(insert, femoral, drive, load, resolution=2.0):
     """Return the equilibrium coordinates (6,) of the first row, and the reason of failure."""
-    model = contact_model("foundation", resolution)
+    model = contact_model("foundation", resolution=resolution * 1e-3)
     pair = ContactPair(femoral, insert, material("polyethylene-linear"))
     pose, reason = EquilibriumPoses(model, model.prepare(pair), drive).at(0, load, None)
     return knee_coordinates(pose), reason
@@ -121,7 +121,9 @@ def test_the_dwell_position_is_the_lowest_position():
         return 10 * MM + 8.0 * ((x - bottom[0]) ** 2 + (z - bottom[1]) ** 2)
 
     femoral = graded_sphere(12 * MM)
-    engine = ContactEngine(contact_model("foundation", 2.0), femoral, material("polyethylene"))
+    engine = ContactEngine(
+        contact_model("foundation", resolution=2e-3), femoral, material("polyethylene")
+    )
     dwell = engine.dwell(dished_insert(height), np.eye(3))
     assert dwell == pytest.approx(bottom, abs=0.2 * MM)
     assert zero_at(dwell)[[0, 2]] == pytest.approx(dwell)
@@ -129,7 +131,9 @@ def test_the_dwell_position_is_the_lowest_position():
 
 
 def dish_case(applied):
-    engine = ContactEngine(contact_model("foundation", 2.0), ball(), material("polyethylene"))
+    engine = ContactEngine(
+        contact_model("foundation", resolution=2e-3), ball(), material("polyethylene")
+    )
     drive = machine(applied, (AP, SI, ML))
     motion = CycleMotion(knee_pose(drive.coordinates), -applied[:, SI], 1.0, 1, drive=drive)
     articular = ArticularSurface.of_insert(dish(50 * MM, spacing=2 * MM), 2 * MM)

@@ -89,7 +89,7 @@ def ball_case(insert, radius, motion, wear_factor, resolution=1.0, facets=3):
 
 
 def swinging_case(femoral, insert, motion, wear_factor=1e-6, resolution=2.0):
-    model = contact_model("foundation", resolution)
+    model = contact_model("foundation", resolution=resolution * 1e-3)
     engine = ContactEngine(model, femoral, material("polyethylene"))
     articular = ArticularSurface.of_insert(insert, resolution * MM)
     return WearCase(engine, articular, motion, Archard(wear_factor), DENSITY)

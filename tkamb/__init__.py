@@ -3,7 +3,7 @@
     import tkamb
     scene = tkamb.load_scene("models/deep_knee_bend/scene.toml")
     results = tkamb.simulate(scene, contact="foundation")
-    model = tkamb.contact_model("hertz", resolution_mm=1.0)
+    model = tkamb.contact_model("hertz", resolution=1e-3)
 
 Each name is imported when it is first used.
 """
@@ -14,12 +14,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tkamb.moved import accept_old_names
-
 if TYPE_CHECKING:
     from tkamb.contact.registry import contact_model
     from tkamb.io.scene import Scene, load_scene
     from tkamb.knee.knee import Knee
+    from tkamb.knee.ligament_laws import QuadraticToe, TwoLine, ligament_law
     from tkamb.knee.ligaments import Ligament
     from tkamb.knee.load import LinkPoint
     from tkamb.knee.loads import KneeLoads
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
     from tkamb.run.results import Results
     from tkamb.run.results_folder import read_results
     from tkamb.run.simulation import simulate
+    from tkamb.show.plots import plot
     from tkamb.show.view.live_window import live
     from tkamb.show.view.show import show as view
 
@@ -41,13 +41,17 @@ __all__ = [
     "LinkPoint",
     "Muscle",
     "PatellarLigament",
+    "QuadraticToe",
     "Results",
     "SagittalWrap",
     "Scene",
+    "TwoLine",
     "__version__",
     "contact_model",
+    "ligament_law",
     "live",
     "load_scene",
+    "plot",
     "read_results",
     "read_scene",
     "simulate",
@@ -60,6 +64,9 @@ _HOMES = {
     "Knee": "tkamb.knee.knee",
     "KneeLoads": "tkamb.knee.loads",
     "Ligament": "tkamb.knee.ligaments",
+    "QuadraticToe": "tkamb.knee.ligament_laws",
+    "TwoLine": "tkamb.knee.ligament_laws",
+    "ligament_law": "tkamb.knee.ligament_laws",
     "LinkPoint": "tkamb.knee.load",
     "Muscle": "tkamb.knee.muscles",
     "PatellarLigament": "tkamb.knee.muscles",
@@ -69,15 +76,14 @@ _HOMES = {
     "contact_model": "tkamb.contact.registry",
     "live": "tkamb.show.view.live_window",
     "load_scene": "tkamb.io.scene",
+    "plot": "tkamb.show.plots",
     "read_results": "tkamb.run.results_folder",
     "read_scene": "tkamb.run.read_scene",
     "view": "tkamb.show.view.show:show",
     "simulate": "tkamb.run.simulation",
 }
 
-__version__ = "0.2.0"
-
-accept_old_names()
+__version__ = "1.0.0rc1"
 
 
 @lru_cache(maxsize=4)
@@ -99,8 +105,6 @@ def code_identity(part: str = "") -> str:
 
 
 def __getattr__(name: str) -> Any:
-    if name == "show":  # the subpackage; `tkamb.show(...)` is the former name of `tkamb.view(...)`
-        return import_module("tkamb.show")
     if name not in _HOMES:
         raise AttributeError(f"module 'tkamb' has no attribute '{name}'")
     module, _, attribute = _HOMES[name].partition(":")

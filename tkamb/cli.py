@@ -17,6 +17,7 @@ from tkamb.commands.import_model import add_data, add_import
 from tkamb.commands.mesh import add_contact, add_mesh, add_no_cache, add_press, without_cache
 from tkamb.commands.options import add_preset, add_scene_options, check_options, overrides_of
 from tkamb.commands.results import add_compare, add_export, add_folder_commands
+from tkamb.commands.settings import add_settings
 from tkamb.commands.studies import add_cohort, add_stability, add_tradeoff
 from tkamb.commands.uncertainty import add_uncertainty
 from tkamb.commands.view import add_live, add_view
@@ -24,7 +25,6 @@ from tkamb.commands.wear import add_wear
 from tkamb.geometry.threads import threads
 from tkamb.io.starter import add_new
 from tkamb.run.guard import guarded, log_to_stderr, say
-from tkamb.run.settings import add_settings
 
 if TYPE_CHECKING:
     from tkamb.io.scene import Scene
@@ -153,6 +153,7 @@ def _run(options: argparse.Namespace) -> int:
     from tkamb.run.timing import Stages
     from tkamb.show.axis import horizontal_axis
     from tkamb.show.headline import cards
+    from tkamb.show.report import report_html
 
     scene = _scene_of(options)
     directory = options.out or scene.output.directory or _default_directory(options.scene)
@@ -169,7 +170,7 @@ def _run(options: argparse.Namespace) -> int:
         )
         if profile:
             results.summary["profile"] = profile.report(results, options.scene)
-        write_results(results, directory, progress=stages.plots)
+        write_results(results, directory, report=lambda run: report_html(run, stages.plots))
     if options.pack:
         from tkamb.run.reproduction import pack
 

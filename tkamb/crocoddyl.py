@@ -73,7 +73,7 @@ class KneeDynamics(crocoddyl.DifferentialActionModelAbstract):
                 f"nu is {costs.nu}", "costs", f"give {count}: the actuation, then the muscles"
             )
         super().__init__(state, count, costs.nr)
-        knee.checked_tensions(dict.fromkeys(muscles, 0.0) | dict(tensions or {}))
+        knee._tensions(dict.fromkeys(muscles, 0.0) | dict(tensions or {}))
         self.knee, self.actuation, self.costs = knee, actuation, costs
         self.muscles, self.tensions = tuple(muscles), dict(tensions or {})
 

@@ -1,10 +1,8 @@
 """The errors of tkamb. A message is one line: where the error is, what is wrong, what to do."""
 
 import difflib
-import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 
 @dataclass(frozen=True)
@@ -25,7 +23,6 @@ class TkambError(Exception):
         what: what is wrong.
         where: file, key, argument or frame; None: no place.
         hint: advice to the user; None: no advice.
-        mend: former name of `hint`, accepted until release 0.3.
     """
 
     exit_status = 1
@@ -35,26 +32,10 @@ class TkambError(Exception):
         what: str,
         where: object = None,
         hint: str | None = None,
-        *,
-        mend: str | None = None,
     ) -> None:
-        if mend is not None:
-            _warn_of_old_name()
-            hint = mend
         self.what, self.where, self.hint = what, where, hint
         message = what if where is None else f"{where}: {what}"
         super().__init__(" ".join((message if hint is None else f"{message}; {hint}").split()))
-
-    @property
-    def mend(self) -> str | None:
-        """Return `hint` by its former name."""
-        _warn_of_old_name()
-        return self.hint
-
-
-def _warn_of_old_name() -> None:
-    """Warn that `mend` is now called `hint`; the warning shows the line of the caller."""
-    warnings.warn("'mend' of an error is now called 'hint'", DeprecationWarning, stacklevel=3)
 
 
 class InputError(TkambError):
@@ -81,21 +62,3 @@ def names_near(name: str, names: Iterable[str], title: str = "there are") -> str
     listed = f"{title}: {', '.join(all_names[: MESSAGE.max_names]) or 'none'}{more}"
     guess = f"did you mean {', '.join(lower[each] for each in close)}? " if close else ""
     return guess + listed
-
-
-def renamed(module: str, name: str, names: Mapping[str, Any]) -> Any:
-    """Return the object that a module had under a former name, with a DeprecationWarning.
-
-    Args:
-        module: dotted name of the module.
-        name: requested name.
-        names: former name -> object.
-
-    Raises:
-        AttributeError: the module has no such name.
-    """
-    if name not in names:
-        raise AttributeError(f"module '{module}' has no attribute '{name}'")
-    message = f"'{name}' of {module} is now called '{names[name].__name__}'"
-    warnings.warn(message, DeprecationWarning, stacklevel=3)
-    return names[name]

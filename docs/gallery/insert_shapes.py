@@ -36,7 +36,7 @@ def pressed(conformity: float = 0.6, thickness: float = 9.0) -> tuple[float, flo
     shape = {"medial_dish_radii": radii, "lateral_dish_radii": radii, "thickness": thickness}
     insert = replace(DESIGN.insert, post=None, **shape)
     pair = ContactPair(femoral, surface(insert.mesh(), "insert"), material("polyethylene"))
-    model = contact_model("lattice", 2.0)
+    model = contact_model("lattice", resolution=2e-3)
     pose = knee_pose([insert.low_point_ap * MILLIMETRE, 0, 0, 0, 0, np.radians(60.0)])
     medial = model.press(model.prepare(pair), LOAD, pose).medial
     return medial.area / MILLIMETRE**2, medial.peak_pressure / MEGAPASCAL

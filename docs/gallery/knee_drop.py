@@ -34,7 +34,7 @@ knee = tkamb.Knee(
     implant=tkamb.Implant(femoral, insert),
     contact=tkamb.contact_model("foundation", resolution=3e-3),
 )
-rest = knee.press(np.zeros(1), MASS * 9.81).pose[1, 3]
+rest = knee.press(np.zeros(1), MASS * 9.81).pose.translation[1]
 
 figure, axes = plt.subplots(figsize=(5.4, 3.4), layout="constrained")
 for theta, name in ((0.5, "midpoint"), (1.0, "implicit Euler")):

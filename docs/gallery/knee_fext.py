@@ -37,7 +37,7 @@ model.addFrame(pin.Frame("my_shank", knee_joint, 0, pin.SE3.Identity(), pin.Fram
 def collateral(name, z):
     """Return a ligament from epicondyle to shank, slack below 90 mm."""
     ends = ("my_thigh", (0.0, 0.0, z)), ("my_shank", (0.0, -0.06, 0.8 * z))
-    return tkamb.Ligament(name, *ends, law="quadratic-toe", stiffness=3000.0, slack_length=0.090)
+    return tkamb.Ligament(name, *ends, tkamb.QuadraticToe(stiffness=3000.0), slack_length=0.090)
 
 
 knee = tkamb.Knee(

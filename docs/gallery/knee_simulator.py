@@ -31,7 +31,7 @@ model.appendBodyToJoint(joint, pin.Inertia(4.0, np.zeros(3), 0.01 * np.eye(3)), 
 model.addFrame(pin.Frame("femur", joint, 0, pin.SE3.Identity(), pin.FrameType.BODY))
 springs = [  # four horizontal springs in front and behind, N per unit strain
     tkamb.Ligament(f"spring {x:+.2f} {z:+.2f}", ("femur", (0, 0, z)), ("tibia", (x, 0.03, z)),
-                   "quadratic-toe", 2000.0, 0.09)
+                   tkamb.QuadraticToe(stiffness=2000.0), 0.09)
     for x in (-0.1, 0.1) for z in (-0.03, 0.03)
 ]  # fmt: skip
 knee = tkamb.Knee(
@@ -52,11 +52,11 @@ def machine(q):
 
 
 q, v, data = np.array([-9e-3, 0, 1e-3, 0, 0]), np.zeros(5), knee.create_data()
-q[1] = knee.press(q, 1000.0).pose[1, 3]
+q[1] = knee.press(q, 1000.0).pose.translation[1]
 drag, path = np.array([500.0, 3000.0, 500.0, 2.0, 2.0]), [1e3 * q]
 for _ in range(80):
     q, v = implicit_step(
-        knee, q, v, 0.01, external=machine(q), theta=1.0, friction_of_joints=drag, data=data
+        knee, q, v, 0.01, fext=machine(q), theta=1.0, friction_of_joints=drag, data=data
     )
     path.append(1e3 * q)
 found = knee.equilibrium(q, 0 * v, 0 * v, machine(q))

@@ -30,7 +30,7 @@ for name in ("hertz", "foundation", "lattice"):
     contact = tkamb.contact_model(name, resolution=3e-3)
     knee = tkamb.Knee(model, implant=tkamb.Implant(femoral, insert), contact=contact)
     data, there = knee.create_data(), q.copy()
-    there[1] = knee.press(q, 1500.0).pose[1, 3]
+    there[1] = knee.press(q, 1500.0).pose.translation[1]
     force = -knee.external_forces(there, v, data=data)[joint].linear
     stiffness[name] = 1e-6 * knee.stiffness(there, v, data)[1, 1]
     assert abs(force[1] + 1500.0) < 5.0, force

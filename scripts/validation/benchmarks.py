@@ -44,7 +44,9 @@ BENCHMARK = BenchmarkSettings()
 
 def _model(name: str, resolution_mm: float, **options: Any) -> Any:
     cached = name.startswith(("lattice", "fe"))
-    return contact_model(name, resolution_mm, **({"cache": False} if cached else {}), **options)
+    return contact_model(
+        name, resolution=resolution_mm * 1e-3, **({"cache": False} if cached else {}), **options
+    )
 
 
 def _only(result: ContactResult) -> CondyleContact:

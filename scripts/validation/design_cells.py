@@ -116,9 +116,9 @@ class PressedDesign:
 
     def __init__(self, design: Design, resolution_mm: float = 2.0):
         self.design = design
-        self.model = contact_model("lattice", resolution_mm, cache=False)
+        self.model = contact_model("lattice", resolution=resolution_mm * 1e-3, cache=False)
         self.source_rule = contact_model(
-            "lattice", resolution_mm, cache=False, pressure_rule="source"
+            "lattice", resolution=resolution_mm * 1e-3, cache=False, pressure_rule="source"
         )
         self._states: dict[str, Any] = {}
 

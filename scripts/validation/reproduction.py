@@ -18,7 +18,7 @@ from tkamb.contact.lattice.source_springs import source_factor
 from tkamb.contact.materials import RambergOsgood
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
-from tkamb.knee.ligaments import two_line_force
+from tkamb.knee.ligament_laws import TwoLine
 from tkamb.run.press import load_pair, press_meshes
 from tkamb.run.simulation import simulate
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
@@ -103,7 +103,7 @@ def template() -> Values:
     return springs | {
         "spring_factor": source_factor(cube),
         "poisson": across / (along + across),  # C12 / (C11 + C12)
-        "ligament_N": float(two_line_force(40e-3 * 1.06, 40e-3, 100e3)),
+        "ligament_N": float(TwoLine(100e3).tension(40e-3 * 1.06, 40e-3)),
         "material_E": law.young_modulus / MEGAPASCAL,
         "material_alpha": law.law.alpha,
         "material_sigma0": law.law.reference_stress / MEGAPASCAL,

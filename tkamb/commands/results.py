@@ -7,6 +7,7 @@ from typing import Any
 
 from tkamb.errors import InputError
 from tkamb.run.guard import say
+from tkamb.units import MILLIMETRE
 
 PAGE_NAME = "compare.html"
 
@@ -131,8 +132,9 @@ def _export_deck(options: argparse.Namespace) -> int:
     if options.out.suffix.lower() != SUFFIX[options.deck]:
         suffix = SUFFIX[options.deck]
         raise InputError(f"is not a {suffix} file", options.out, f"give a name like frame{suffix}")
-    if options.resolution is not None and not 0 < options.resolution <= MAP_GRID.coarsest_mm:
-        hint = f"give more than 0, at most {MAP_GRID.coarsest_mm:g} mm"
+    coarsest_mm = MAP_GRID.coarsest / MILLIMETRE
+    if options.resolution is not None and not 0 < options.resolution <= coarsest_mm:
+        hint = f"give more than 0, at most {coarsest_mm:g} mm"
         raise InputError(f"resolution {options.resolution} mm", "--resolution", hint)
     check_output_file(options.out, options.force)
     result = frame_press(options.folder, options.frame, options.resolution)

@@ -61,6 +61,7 @@ def _cohort(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from tkamb.run.workers import PoolOptions
+    from tkamb.show.cohort_report import cohort_html
     from tkamb.studies.cohort.plan import load_cohort
     from tkamb.studies.cohort.run import REPORT_NAME, Part, run_cohort
 
@@ -76,6 +77,7 @@ def _cohort(options: argparse.Namespace) -> int:
         resume=options.resume,
         force=options.force,
         progress=lambda runs, count: tqdm(runs, total=count, unit="run", disable=None),
+        report=cohort_html,
     )
     failed = [n for n, outcome in outcomes.items() if outcome.reason]
     for n in failed[: COHORT_OUTPUT.max_failed_runs]:

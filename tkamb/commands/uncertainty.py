@@ -61,6 +61,7 @@ def _uncertainty(options: argparse.Namespace) -> int:
     from tqdm import tqdm
 
     from tkamb.io.scene import load_scene
+    from tkamb.show.report import report_html
     from tkamb.studies.uncertainty.run import estimate_uncertainty
 
     overrides = overrides_of(options)
@@ -80,6 +81,7 @@ def _uncertainty(options: argparse.Namespace) -> int:
         resume=options.resume,
         force=options.force,
         progress=lambda samples, count: tqdm(samples, total=count, unit="sample", disable=None),
+        report=report_html,
     )
     for line in warnings_of(result):
         say(line)
@@ -208,6 +210,8 @@ def warnings_of(uncertainty: "Uncertainty") -> list[str]:
             f"{NOTABLE_FAILED:.0%} of the samples failed (at most {share.max():.0%}), most often: "
             f"{why}; their bands hold for the poses that are possible, see failed_share"
         )
+    if summary.get("unbalanced_patella"):
+        lines.append(summary["unbalanced_patella"])
     if not uncertainty.tornado:
         lines.append("too few samples for tornado.csv: give 6 per input or more")
     return lines

@@ -21,6 +21,7 @@ from tkamb.contact.samples import (
 )
 from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.frames import SIDES, Array, Mask
+from tkamb.units import MILLIMETRE
 
 Law = Literal["nonlinear", "linear"]
 
@@ -122,14 +123,21 @@ class ElasticFoundation(ContactModel):
     ) -> ContactResult:
         """Return the contact at a pose; see `ContactModel`."""
         if not np.isfinite(pose).all():
-            return ContactResult.failed(state, pose, "the pose is not finite")
+            return ContactResult.out_of_range(state, pose, "the pose is not finite")
         samples = state.surface
         meeting = meet(samples, state.pair.femoral, pose)
         gap = meeting.gap
         strain = np.maximum(-gap, 0.0) / np.maximum(samples.thickness, FOUNDATION.least_thickness)
         if (deep := strain >= DEEPEST).any():
             full_depth = (samples.depth >= samples.thickness)[deep].any()
-            return ContactResult.failed(state, pose, TOO_DEEP if full_depth else OVER_THE_EDGE)
+            k = int(strain.argmax())
+            words = TOO_DEEP if full_depth else OVER_THE_EDGE
+            thickness = max(float(samples.thickness[k]), FOUNDATION.least_thickness)
+            # No ray ends in a column that lies wholly inside the femur: its gap is -inf.
+            depth = -gap[k] if np.isfinite(gap[k]) else state.pair.approach(pose)
+            limit = DEEPEST * thickness / MILLIMETRE
+            measured = f"{words}: {depth / MILLIMETRE:.2f} mm deep, at most {limit:.2f} mm"
+            return ContactResult.out_of_range(state, pose, measured)
         pressure = layer_pressure(self.law, state.pair.material, strain)
         pressure[grazing(samples, meeting)] = 0.0
         medial = medial_points(samples.points, pose, state.pair.split)

@@ -14,6 +14,7 @@ from tkamb.contact.model import ContactModel
 from tkamb.contact.result import CondyleContact, ContactResult, Guess, peak_flags, thickness_under
 from tkamb.contact.samples import MAP_POINT, SampledContact, SurfaceSamples, gaps_along_normals
 from tkamb.geometry.frames import SIDES, Array, Index
+from tkamb.units import MILLIMETRE
 
 
 @dataclass(frozen=True)
@@ -169,7 +170,7 @@ class Hertz(ContactModel):
     ) -> ContactResult:
         """Return the contact at a pose; see `ContactModel`."""
         if not np.isfinite(pose).all():
-            return ContactResult.failed(state, pose, "the pose is not finite")
+            return ContactResult.out_of_range(state, pose, "the pose is not finite")
         samples, material = state.surface, state.pair.material
         # The femoral component is rigid, so only the insert's compliance counts.
         plane_modulus = material.young_modulus / (1 - material.poisson_ratio**2)
@@ -181,7 +182,9 @@ class Hertz(ContactModel):
                 continue
             if geometry.contact is None:
                 if pose[1, 3] < geometry.height:
-                    return ContactResult.failed(state, pose, f"{SIDES[side]} condyle {CONFORMING}")
+                    return ContactResult.out_of_range(
+                        state, pose, f"{SIDES[side]} condyle {CONFORMING}"
+                    )
                 continue
             depth = indentation(geometry, pose)
             if depth <= 0:
@@ -191,14 +194,15 @@ class Hertz(ContactModel):
             patch = contact_ellipse(flat, steep, depth, plane_modulus)
             pressure[side], share = map_pressure(samples, geometry.contact, patch)
             if share < HERTZ.least_share_on_insert:
-                return ContactResult.failed(
+                return ContactResult.out_of_range(
                     state, pose, f"{SIDES[side]} contact ellipse leaves the insert"
                 )
             described = patches[side] = _described(samples, geometry.contact, patch)
             if depth >= described.thickness:
-                return ContactResult.failed(
-                    state, pose, f"the {SIDES[side]} condyle is deeper than the insert is thick"
-                )
+                words = f"the {SIDES[side]} condyle is deeper than the insert is thick"
+                most = described.thickness / MILLIMETRE
+                measured = f"{words}: {depth / MILLIMETRE:.2f} mm deep, at most {most:.2f} mm"
+                return ContactResult.out_of_range(state, pose, measured)
             if patch.long_axis > described.thickness:
                 flags.append(
                     f"the long semi-axis of the {SIDES[side]} contact ellipse exceeds the "

@@ -14,7 +14,7 @@ from tkamb.contact.pair import ContactPair
 from tkamb.contact.result import ContactResult, ContactStatus, Guess, WarmStart
 from tkamb.errors import InputError
 from tkamb.geometry.first_touch import Touch
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, transform
 from tkamb.units import MILLIMETRE
 
 
@@ -136,9 +136,7 @@ def press_by_search(
     check_load(load)
     pose = np.array(pose, float)
     if not math.isfinite(state.pair.first_touch_height(pose)):
-        return ContactResult.failed(
-            state, pose, "the femoral component does not lie over the insert"
-        )
+        return ContactResult.out_of_range(state, pose, beside_words(state.pair, pose))
     if load == 0:
         return unloaded_result(model, state, pose)
     evaluations = _Evaluations(model, state, pose, guess)
@@ -147,10 +145,23 @@ def press_by_search(
     if not math.isfinite(search.approach):
         why = evaluations.at(search.deepest).flags
         problem = f"a load of {load:g} N cannot be reached"
-        return ContactResult.failed(
+        return ContactResult.out_of_range(
             state, pose, problem, *why, iterations=search.evaluations, residual=search.residual
         )
     return within_insert(state, _carried(evaluations.at(search.approach), search, load))
+
+
+def beside_words(pair: ContactPair, pose: Array) -> str:
+    """Return that the femoral component does not lie over the insert, with the distance in x and z.
+
+    The distance is that of the two bounding boxes; it is not stated if they overlap.
+    """
+    femur = transform(pose, pair.femoral.vertices)[:, [0, 2]]
+    insert = pair.insert.vertices[:, [0, 2]]
+    apart = np.maximum(insert.min(0) - femur.max(0), femur.min(0) - insert.max(0))
+    distance = float(np.linalg.norm(np.maximum(apart, 0.0)))
+    words = "the femoral component does not lie over the insert"
+    return words if distance == 0.0 else f"{words}, but {distance / MILLIMETRE:.1f} mm beside it"
 
 
 def _carried(result: ContactResult, search: LoadSearch, load: float) -> ContactResult:
@@ -280,7 +291,9 @@ def within_insert(state: Any, result: ContactResult, *more: str) -> ContactResul
     if touch is not None and result.approach > 0:
         ratio, words = compression(state.pair, touch, result)
         if ratio >= 1.0:
-            return ContactResult.failed(state, result.pose, f"{words}: {THROUGH}", *result.flags)
+            return ContactResult.out_of_range(
+                state, result.pose, f"{words}: {THROUGH}", *result.flags
+            )
         if ratio >= PRESS.flagged_thickness_share:
             more = (*more, f"{words}: {THROUGH}")
     return replace(result, flags=(*result.flags, *more)) if more else result

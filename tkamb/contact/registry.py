@@ -21,9 +21,11 @@ from tkamb.units import MILLIMETRE
 class MapGridSettings:
     """The spacing of a pressure map."""
 
-    coarsest_mm: float = 10.0
-    """mm: largest accepted spacing. Chosen because a condyle's contact is 5 to 20 mm across, and a
+    coarsest: float = 10.0 * MILLIMETRE
+    """m: largest accepted spacing. Chosen because a condyle's contact is 5 to 20 mm across, and a
     coarser map does not resolve it."""
+    usual: float = 1.0 * MILLIMETRE
+    """m: default spacing, as `contact.resolution_mm` of a scene."""
 
 
 MAP_GRID = MapGridSettings()
@@ -71,35 +73,26 @@ def contact_class(name: str) -> type[ContactModel]:
 
 def contact_model(
     name: str,
-    resolution_mm: float | None = None,
     *,
-    resolution: float | None = None,
+    resolution: float = MAP_GRID.usual,
     **options: Any,
 ) -> ContactModel:
     """Return the contact model of a name.
 
     Args:
         name: one of `contact_names()`.
-        resolution_mm: spacing of the map points, mm; by default 1 mm.
-        resolution: spacing of the map points, m; an alternative to `resolution_mm`.
+        resolution: spacing of the map points, m.
         options: other options of the model, which are fields of its class (SI).
 
     Raises:
         InputError: the name, an option or the value of an option is unknown; the resolution is not
-            positive, too coarse, or given twice.
+            positive or too coarse.
     """
     cls, where = contact_class(name), f"contact model '{name}'"
-    if resolution is not None and resolution_mm is not None:
-        raise InputError("resolution and resolution_mm are both given", where, "give one of them")
-    if resolution is None:
-        resolution_mm = 1.0 if resolution_mm is None else resolution_mm
-        words, spacing = f"resolution {resolution_mm} mm", resolution_mm * MILLIMETRE
-    else:
-        words, spacing = f"resolution {resolution} m", resolution
-    if not (math.isfinite(spacing) and 0 < spacing <= MAP_GRID.coarsest_mm * MILLIMETRE):
-        most = MAP_GRID.coarsest_mm
-        hint = f"give more than 0, at most {most:g} mm ({most / 1e3:g} m)"
-        raise InputError(words, where, hint)
+    if not (math.isfinite(resolution) and 0 < resolution <= MAP_GRID.coarsest):
+        most = MAP_GRID.coarsest
+        hint = f"give more than 0, at most {most / MILLIMETRE:g} mm ({most:g} m)"
+        raise InputError(f"resolution {resolution} m", where, hint)
     known_options = _options(cls)
     for option, value in options.items():
         if option not in known_options:
@@ -109,7 +102,7 @@ def contact_model(
             advice = f"one of {', '.join(map(str, choices))}"
             raise InputError(f"option '{option}' cannot be {value!r}", where, advice)
         _check_kind(cls, option, value, where)
-    return cls(resolution=spacing, **options)  # type: ignore[call-arg]
+    return cls(resolution=resolution, **options)  # type: ignore[call-arg]
 
 
 def contact_options(name: str) -> tuple[str, ...]:

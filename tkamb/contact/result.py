@@ -126,13 +126,23 @@ class ContactResult:
         parts = [self.status.value, *(sides or ["nothing touches"]), f"{len(self.points)} points"]
         return f"<tkamb.ContactResult: {'; '.join(parts)}>"
 
+    @property
+    def failed(self) -> bool:
+        """Whether the result has no numbers, because the model is out of its range."""
+        return self.status is ContactStatus.OUT_OF_RANGE
+
+    @property
+    def reason(self) -> str:
+        """Why the status is not OK, in a sentence; empty: it is OK."""
+        return "" if self.status is ContactStatus.OK else "; ".join(self.flags)
+
     @cached_property
     def approach(self) -> float:
         """m, travel along -y since first touch; 0 when apart, NaN when out of range.
 
         It is computed at its first use, from the pose and the undeformed bodies.
         """
-        if self.status is ContactStatus.OUT_OF_RANGE:
+        if self.failed:
             return math.nan
         return self.pair.approach(self.pose)
 
@@ -170,9 +180,11 @@ class ContactResult:
         """
         surface, pose = state.surface, np.array(pose, float)
         if not np.isfinite(pressure).all():
-            return cls.failed(state, pose, "the femoral component lies too deep in the insert")
+            return cls.out_of_range(
+                state, pose, "the femoral component lies too deep in the insert"
+            )
         if not pressure.any() and (passed := state.pair.passed_through(pose)):
-            return cls.failed(state, pose, passed)
+            return cls.out_of_range(state, pose, passed)
         area = surface.area if area is None else area
         if nodal_force is None:
             nodal_force = -(pressure * area)[:, None] * surface.normals
@@ -219,7 +231,7 @@ class ContactResult:
         )
 
     @classmethod
-    def failed(
+    def out_of_range(
         cls,
         state: PreparedContact,
         pose: Array,

@@ -78,8 +78,8 @@ def lattice_of_file(
     """
     if out is not None and Path(out).suffix != ".vtu":
         raise InputError(f"'{out}' is not a .vtu file", "out", "give a name like lattice.vtu")
-    if not 0 < resolution_mm <= MAP_GRID.coarsest_mm:
-        hint = f"give more than 0, at most {MAP_GRID.coarsest_mm:g} mm"
+    if not 0 < resolution_mm * MILLIMETRE <= MAP_GRID.coarsest:
+        hint = f"give more than 0, at most {MAP_GRID.coarsest / MILLIMETRE:g} mm"
         raise InputError(f"resolution {resolution_mm} mm", "mesh lattice", hint)
     surface = load_surface(insert, units, axes, name="insert", closed=True)
     if side == "left":

@@ -92,7 +92,7 @@ class Anatomy:
 
 def find_anatomy(
     model: pin.Model,
-    names: Mapping[str, str],
+    names: Mapping[str, str | None],
     joints: Sequence[str],
     plane: pin.SE3 | None,
 ) -> Anatomy:
@@ -100,7 +100,7 @@ def find_anatomy(
 
     Args:
         model: any Pinocchio model.
-        names: part of `PARTS` -> name of its frame in the model.
+        names: part of `PARTS` -> name of its frame in the model; None: its default.
         joints: expected names of the knee's joints; empty: no check.
         plane: pose of the patella's sagittal plane in the frame "femur"; None: the default of
             `tkamb.knee.parts.Extensor`.
@@ -113,8 +113,11 @@ def find_anatomy(
             raise InputError(f"no part '{part}' of the knee", "frames", names_near(part, PARTS))
     frames = {}
     for part in PARTS:
-        if part in names or part in NEEDED or model.existFrame(part):
-            frames[part] = _frame(model, names.get(part, part), part)
+        name = names.get(part, part if _offers(model, part) else None)
+        if name is not None:
+            frames[part] = _frame(model, name, part)
+        elif part in NEEDED:
+            raise _missing(model, part)
     tibia, femur = frames["tibia"], frames["femur"]
     path = _path(model, tibia.joint, femur.joint)
     if not path:
@@ -155,8 +158,26 @@ def find_anatomy(
         sagittal,
         path,
         shank,
-        names,
+        {part: name for part, name in names.items() if name is not None},
     )
+
+
+def _offers(model: pin.Model, part: str) -> bool:
+    """Return whether the model has a frame with the name of a part. Frames of joints do not count:
+
+    a joint "hip" need not lie in the hip centre.
+    """
+    return any(f.name == part and f.type != pin.FrameType.JOINT for f in model.frames)
+
+
+def _missing(model: pin.Model, part: str) -> InputError:
+    """Return the error for a part that the model must have."""
+    names = [frame.name for frame in model.frames]
+    hint = f"name it: frames={{'{part}': ...}}; {names_near(part, names)}"
+    what = f"no frame '{part}' in the model"
+    if model.existFrame(part):
+        what, hint = f"'{part}' is a joint", f"if it is meant: frames={{'{part}': '{part}'}}"
+    return InputError(what, "frames", hint)
 
 
 def _frame(model: pin.Model, name: str, part: str | None = None) -> FixedFrame:
@@ -233,6 +254,43 @@ def _shank(
 def _hip(femur: FixedFrame, path: tuple[int, ...]) -> FixedFrame:
     """Return the frame of the femur's parent joint, or the femur's frame if it is a knee joint."""
     return femur if femur.joint in path else FixedFrame(femur.joint, pin.SE3.Identity())
+
+
+@dataclass(frozen=True)
+class AnatomySettings:
+    """Check that femur and tibia are not exchanged."""
+
+    least_lever: float = 0.05
+    """m: a thigh whose centre of mass lies farther below the femoral component, with a shank whose
+    centre of mass lies farther above the insert, are exchanged. Chosen because the centres of mass
+    of thigh and shank lie 0.15 to 0.3 m from the knee."""
+
+
+ANATOMY = AnatomySettings()
+
+
+def check_not_exchanged(anatomy: Anatomy) -> None:
+    """Raise an error if the masses of the model say that femur and tibia are exchanged.
+
+    Raises:
+        InputError: the femur's centre of mass lies below the knee, and the tibia's above it.
+    """
+    levers = [_centre_height(anatomy.model, frame) for frame in (anatomy.femoral, anatomy.insert)]
+    if -levers[0] > ANATOMY.least_lever and levers[1] > ANATOMY.least_lever:
+        raise InputError(
+            f"femur and tibia are exchanged: the femur's centre of mass lies {-levers[0]:.2f} m "
+            f"below the femoral component, the tibia's {levers[1]:.2f} m above the insert",
+            "frames",
+            "name the frames: frames={'femur': ..., 'tibia': ...}; y points up in both",
+        )
+
+
+def _centre_height(model: pin.Model, frame: FixedFrame) -> float:
+    """Return the height of a body's centre of mass, along y of a frame on it, m; 0 without mass."""
+    inertia = model.inertias[frame.joint]
+    if not frame.joint or not inertia.mass > 0.0:
+        return 0.0
+    return float(frame.placement.actInv(inertia.lever)[1])
 
 
 def knee_size(anatomy: Anatomy) -> int:

@@ -1,6 +1,7 @@
 """The parts of a knee on a user's model, and their poses at a configuration."""
 
 import copy
+import uuid
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, Self
@@ -16,10 +17,10 @@ from tkamb.geometry.frames import (
     mirrored_pose,
     sagittal_pose,
 )
-from tkamb.knee.anatomy import find_anatomy
+from tkamb.knee.anatomy import check_not_exchanged, find_anatomy
 from tkamb.knee.canonical import Bridge, CanonicalChain, KneePose, se3
 from tkamb.knee.load import PointForces
-from tkamb.knee.muscles import Muscle, TensionLine, checked_tensions, tension_lines
+from tkamb.knee.muscles import Muscle, checked_tensions, tension_lines
 from tkamb.knee.parts import (
     Extensor,
     Implant,
@@ -33,11 +34,27 @@ from tkamb.knee.parts import (
 
 if TYPE_CHECKING:
     from tkamb.contact.model import ContactModel, ProbedContact
+    from tkamb.contact.result import Guess
     from tkamb.geometry.closest import ClosestPointQuery
     from tkamb.knee.contact import KneeContact
     from tkamb.knee.extensor import ExtensorLines
-    from tkamb.knee.ligaments import BundleArrays, Ligament
+    from tkamb.knee.ligaments import Ligament
     from tkamb.knee.patella import PatellaState
+
+
+@dataclass(frozen=True)
+class KneeCheckSettings:
+    """Checks of a configuration."""
+
+    unit_tolerance: float = 1e-6
+    """1: largest error of a quaternion's norm. Chosen because an error of this size changes a force
+    by a millionth."""
+    max_distance: float = 0.1
+    """m: largest distance of the components. Chosen because the ligaments of a knee tear at 20 mm
+    of distraction."""
+
+
+KNEE_CHECK = KneeCheckSettings()
 
 PATELLAR_LIGAMENT = "patellar_ligament"
 """Name of the patellar ligament among the tensions."""
@@ -55,12 +72,21 @@ class KneeData:
             model.
         patella: state of the patella from the last call; None: not computed yet.
         seen: bytes of the last pose, and the contact at that pose; None: not computed yet.
+        start: warm start of the next press, from the last press or evaluation; None: there was
+            none.
+        knee: identity of the knee that made the data.
     """
 
     data: Any
     probe: Any = None
     patella: "PatellaState | None" = None
     seen: "tuple[bytes, ProbedContact] | None" = None
+    start: "Guess | None" = None
+    knee: str = ""
+
+    def __repr__(self) -> str:
+        """Return the knee that made the data."""
+        return f"<tkamb.KneeData of {self.knee}>"
 
 
 class AssembledKnee:
@@ -80,7 +106,7 @@ class AssembledKnee:
         contact: "ContactModel | KneeContact | str | None" = None,
         friction: float = 0.0,
         muscles: Iterable[Muscle] = (),
-        frames: Mapping[str, str] | None = None,
+        frames: Mapping[str, str | None] | None = None,
         joints: Sequence[str] = (),
         cache: bool = False,
     ) -> None:
@@ -91,8 +117,9 @@ class AssembledKnee:
         self.model, self.side, self.friction = model, side, float(friction)
         self.implant, is_left = implant or Implant(), side == "left"
         self.anatomy = find_anatomy(
-            model, frames or {}, joints, extensor.plane if extensor else None
+            model, frames or {}, joints, _placement(extensor.plane) if extensor else None
         )
+        check_not_exchanged(self.anatomy)
         surfaces = surfaces_of(self.implant, is_left, contact is not None, extensor is not None)
         insert, insert_surface = placed_insert(self.anatomy, self.implant, surfaces.insert, is_left)
         self._surfaces = replace(surfaces, insert=insert_surface)
@@ -107,8 +134,10 @@ class AssembledKnee:
             self.extensor_lines = extensor_lines(self.bridge, extensor, self._surfaces)
         self.contact: KneeContact | None = None
         if contact is not None:
-            prepared = prepared_contact(contact, self.implant, self._surfaces, cache)
-            self.contact = prepared.changed(self.friction)
+            # Another knee with the same implant and model shares it, as long as one of them lives.
+            self._prepared = prepared_contact(contact, self.implant, self._surfaces, cache)
+            self.contact = self._prepared.changed(self.friction)
+        self._identity = _identity(self)
 
     def _set_ligaments(self, bundles: "Iterable[Ligament]") -> None:
         self.ligaments = tuple(bundle_on_chain(self.bridge, bundle) for bundle in bundles)
@@ -126,6 +155,7 @@ class AssembledKnee:
 
         other = copy.copy(self)
         other.contact = KneeContact(model, self._need_contact().pair, self.friction)
+        other._identity = _identity(other)
         return other
 
     @property
@@ -149,62 +179,66 @@ class AssembledKnee:
         return self._surfaces.button
 
     @property
-    def query(self) -> "ClosestPointQuery":
+    def _query(self) -> "ClosestPointQuery":
         """Query for closest points of femoral component and insert, prepared at the first use."""
         return self._need_contact().pair.closest_points
 
     def create_data(self) -> KneeData:
         """Return data that a caller passes from call to call to save time."""
         probe = None if self.contact is None else self.contact.probe()
-        return KneeData(self.model.createData(), probe)
+        return KneeData(self.model.createData(), probe, knee=self._identity)
 
-    def create_data_for_kinematics(self) -> KneeData:
+    def _kinematic_data(self) -> KneeData:
         """Return data for calls that compute no contact."""
-        return KneeData(self.model.createData())
+        return KneeData(self.model.createData(), knee=self._identity)
+
+    def _data(self, data: KneeData | None, contact: bool = True) -> KneeData:
+        """Return data of this knee; None: new data, without a probe if not `contact`.
+
+        Raises:
+            InputError: the data are those of Pinocchio, or of another knee.
+        """
+        if data is None:
+            return self.create_data() if contact else self._kinematic_data()
+        if not isinstance(data, KneeData):
+            raise InputError(
+                f"a {type(data).__name__} is no data of a tkamb.Knee",
+                "data",
+                "give knee.create_data(); Pinocchio's data is its attribute data",
+            )
+        if data.knee != self._identity:
+            raise InputError(
+                f"the data belong to another knee, {data.knee}, not to this one, {self._identity}",
+                "data",
+                "give the result of create_data() of this knee",
+            )
+        return data
 
     def pose(self, q: Array) -> pin.SE3:
         """Return the pose of the femoral component in the insert frame."""
-        kinematics = self._kinematics(self.create_data_for_kinematics(), q)
+        kinematics = self._kinematics(self._kinematic_data(), q)
         return se3(mirrored_pose(kinematics.pose) if self.left else kinematics.pose)
 
     def coordinates(self, q: Array) -> Array:
         """Return the knee coordinates (6,) in the order of `KNEE_COORDINATES`, m and rad.
 
-        The coordinates are those of Grood and Suntay (`tkamb.geometry.frames`). A left knee has the
-        coordinates of its mirror image, with the same clinical signs.
+        ap, si and ml are translations along x, y and z of the insert frame, with z to the patient's
+        right for both knees. The rotations are those of Grood and Suntay
+        (`tkamb.geometry.frames`), with their clinical signs for both knees.
         """
-        return self._kinematics(self.create_data_for_kinematics(), q).coordinates
-
-    def at(self, q: Array, data: KneeData, v: Array | None = None) -> KneePose:
-        """Return the pose of the knee at q, and update the placements in `data`.
-
-        With a velocity v (nv,), the velocities in `data` are updated, too.
-        """
-        return self._kinematics(data, q, v)
+        kinematics = self._kinematics(self._kinematic_data(), q)
+        return self._coordinate_signs * kinematics.coordinates
 
     @property
-    def crossing(self) -> "BundleArrays | None":
-        """The ligaments between femur and tibia; None: there are none."""
-        return self._crossing
+    def _coordinate_signs(self) -> Array:
+        """Signs (6,) between the coordinates of the equations and those of the user's knee."""
+        return np.array([1.0, 1.0, -1.0 if self.left else 1.0, 1.0, 1.0, 1.0])
 
-    @property
-    def muscle_lines(self) -> dict[str, TensionLine]:
-        """Name of each muscle of given tension -> its line."""
-        return self._lines
-
-    def checked_tensions(self, tensions: Mapping[str, float] | float | None) -> dict[str, float]:
-        """Return muscle -> tension, N, after a check; see `Knee.external_forces`."""
-        return self._tensions(tensions)
-
-    def loads_patella(self, tensions: Mapping[str, float]) -> bool:
+    def _loads_patella(self, tensions: Mapping[str, float]) -> bool:
         """Return whether the extensor mechanism pulls, or a ligament ends on the patella."""
         return bool(self._others) or self._pulls(tensions)
 
-    def patella_at(self, kinematics: KneePose, data: KneeData) -> "PatellaState":
-        """Return the patella at a pose of the knee, from q or by its equilibrium."""
-        return self._find_patella(kinematics, data)
-
-    def loads_beside(
+    def _loads_beside(
         self,
         kinematics: KneePose,
         patella: "PatellaState | None",
@@ -241,10 +275,10 @@ class AssembledKnee:
         w on the insert and -w on the femur is -J^T w. A stiffness K of the knee changes the
         generalised force by -J^T K J per displacement.
         """
-        data = self.create_data_for_kinematics() if data is None else data
-        return self.bridge.relative_jacobian(data.data, self._check(q, "q", self.model.nq))
+        data = self._data(data, contact=False)
+        return self.bridge.relative_jacobian(data.data, self._check_q(q))
 
-    def link_poses(self, q: Array, femur: Array, data: KneeData) -> tuple[dict[str, Array], bool]:
+    def _drawn_links(self, q: Array, femur: Array, data: KneeData) -> tuple[dict[str, Array], bool]:
         """Return link -> pose (4, 4) in the insert frame. A left knee is mirrored to a right one.
 
         Args:
@@ -264,7 +298,7 @@ class AssembledKnee:
                 patella = None
         return self._link_poses(kinematics, patella), patella is not None
 
-    def extensor_paths(self, poses: dict[str, Array]) -> dict[str, Array]:
+    def _extensor_paths(self, poses: dict[str, Array]) -> dict[str, Array]:
         """Return the paths (n, 3), m, of quadriceps and patellar ligament, insert frame.
 
         The result is empty without an extensor mechanism or without a pose of the patella.
@@ -274,9 +308,9 @@ class AssembledKnee:
         muscle, ligament = self.extensor_lines.paths_at(poses)
         return {self.extensor_lines.muscle.name: muscle.points, PATELLAR_LIGAMENT: ligament.points}
 
-    def nearest_points(self, coordinates: Array) -> dict[str, Array]:
+    def _nearest_points(self, coordinates: Array) -> dict[str, Array]:
         """Return side -> point (3,), m, where the undeformed condyle is nearest to the insert."""
-        gaps = self.query.at(knee_pose(coordinates))
+        gaps = self._query.at(knee_pose(coordinates))
         centres = {"medial": gaps.medial.centre}
         return centres | ({"lateral": gaps.lateral.centre} if gaps.lateral else {})
 
@@ -286,8 +320,44 @@ class AssembledKnee:
             raise InputError(f"{name} has the shape {array.shape}", "Knee", f"give ({size},)")
         return array
 
-    def _kinematics(self, data: KneeData, q: Array, v: Array | None = None) -> KneePose:
+    def _check_q(self, q: Array) -> Array:
+        """Return q after a check of its size, and of its quaternions."""
         q = self._check(q, "q", self.model.nq)
+        if not pin.isNormalized(self.model, q, KNEE_CHECK.unit_tolerance) and np.isfinite(q).all():
+            unit = q.copy()
+            pin.normalize(self.model, unit)
+            error = float(np.abs(q - unit).max())
+            raise InputError(
+                f"q is not normalised: a component of a quaternion is off by {error:.3g}",
+                "Knee",
+                "call pin.normalize(model, q)",
+            )
+        return q
+
+    def _check_place(self, pose: Array) -> None:
+        """Raise an error if the components are nowhere near each other.
+
+        Raises:
+            ComputationError: the femoral component is far from the insert, or below it.
+        """
+        if self.femoral is None or self.insert is None or not np.isfinite(pose).all():
+            return
+        (low, high), bounds = self.insert.bounds, self.femoral.bounds
+        centre = pose[:3, :3] @ bounds.mean(axis=0) + pose[:3, 3]
+        apart = float(np.linalg.norm(np.maximum(np.maximum(low - centre, centre - high), 0.0)))
+        apart -= 0.5 * float(np.linalg.norm(bounds[1] - bounds[0]))
+        if apart > KNEE_CHECK.max_distance:
+            words = f"the femoral component is {apart:.3g} m or more away from the insert"
+        elif centre[1] < low[1]:
+            words = (
+                f"the femoral component lies {low[1] - centre[1]:.3g} m below the insert's bottom"
+            )
+        else:
+            return
+        raise ComputationError(words, "q", "check q and the frames femur, tibia, femoral, insert")
+
+    def _kinematics(self, data: KneeData, q: Array, v: Array | None = None) -> KneePose:
+        q = self._check_q(q)
         if v is None:
             pin.forwardKinematics(self.model, data.data, q)
         else:
@@ -356,3 +426,16 @@ class AssembledKnee:
             for joint, force in self._lines[name].forces(data.data, tensions[name]):
                 total[joint] += force
         return pin.StdVec_Force(total)
+
+
+def _placement(pose: Any) -> pin.SE3 | None:
+    """Return a pose, `pin.SE3` or (4, 4), as `pin.SE3`."""
+    if pose is None or isinstance(pose, pin.SE3):
+        return pose
+    return se3(np.asarray(pose, float))
+
+
+def _identity(knee: AssembledKnee) -> str:
+    """Return words for a knee, with a random number that no other knee has."""
+    contact = "no contact" if knee.contact is None else knee.contact.model.name
+    return f"'{knee.model.name}, {knee.side}, {contact}, {uuid.uuid4().hex[:8]}'"

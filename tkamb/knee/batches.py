@@ -5,12 +5,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.contact.result import ContactResult, ContactStatus
+from tkamb.contact.result import ContactStatus
 from tkamb.errors import InputError
 from tkamb.geometry.frames import SIDES, Array
+from tkamb.knee.pressed import KneeContactResult, contact_of_user
+from tkamb.units import MEGAPASCAL
 
 if TYPE_CHECKING:
-    from tkamb.contact.result import Guess
     from tkamb.knee.assembled import KneeData
     from tkamb.knee.knee import Knee
     from tkamb.knee.solution_derivatives import PressDerivatives
@@ -31,7 +32,7 @@ class PressBatch:
         derivatives: derivatives of each press; empty: not asked for.
     """
 
-    results: tuple[ContactResult, ...]
+    results: tuple[KneeContactResult, ...]
     force: Array
     peak_pressure: Array
     area: Array
@@ -40,6 +41,19 @@ class PressBatch:
     pressure: Array
     derivatives: "tuple[PressDerivatives, ...]" = ()
 
+    def __repr__(self) -> str:
+        """Return the number of poses, of failures, and the largest peak pressure."""
+        failed = sum(one.failed for one in self.results)
+        peak = np.nanmax(self.peak_pressure, initial=0.0) / MEGAPASCAL
+        return (
+            f"<tkamb.PressBatch: {len(self.results)} poses, {failed} failed; peak {peak:.1f} MPa>"
+        )
+
+    @property
+    def failed(self) -> Array:
+        """Whether each press failed, shape (n,)."""
+        return np.array([one.failed for one in self.results], bool)
+
     @property
     def status(self) -> tuple[ContactStatus, ...]:
         """Status of each press."""
@@ -47,7 +61,7 @@ class PressBatch:
 
 
 def press_all(
-    knee: "Knee", q: Array, load: float | Array, guess: "Guess | None", derivatives: bool
+    knee: "Knee", q: Array, load: float | Array, data: "KneeData", derivatives: bool
 ) -> PressBatch:
     """Return the presses at q (n, nq) under one load, or a load per pose (n,), N.
 
@@ -59,15 +73,12 @@ def press_all(
     count = len(q)
     if np.shape(load) not in ((), (count,)):
         raise InputError(f"the shape is {np.shape(load)}", "load", f"give a number or ({count},)")
-    results, slopes, start = [], [], guess
+    results, slopes = [], []
     for one, its_load in zip(np.asarray(q, float), np.broadcast_to(load, count), strict=True):
-        result, next_start = knee.press_from(one, float(its_load), start)
-        # A failed press has no pressures to start from.
-        if result.status is ContactStatus.OK:
-            start = next_start
+        result, start = knee._press_from(one, float(its_load), data)
         if derivatives:
-            slopes.append(knee.press_slopes(result, next_start))
-        results.append(result)
+            slopes.append(knee._press_slopes(result, start))
+        results.append(contact_of_user(result, knee.left))
     force, peak, area = (_of_condyles(results, one) for one in ("force", "peak_pressure", "area"))
     return PressBatch(
         tuple(results),
@@ -75,13 +86,13 @@ def press_all(
         peak,
         area,
         np.array([one.approach for one in results]),
-        np.array([one.pose for one in results]),
+        np.array([one.pose.homogeneous for one in results]),
         np.array([one.pressure for one in results]),
         tuple(slopes),
     )
 
 
-def _of_condyles(results: list[ContactResult], name: str) -> Array:
+def _of_condyles(results: list[KneeContactResult], name: str) -> Array:
     """Return a value (n, 2) of the condyles."""
     values = np.zeros((len(results), len(SIDES)))
     for k, result in enumerate(results):
@@ -89,7 +100,7 @@ def _of_condyles(results: list[ContactResult], name: str) -> Array:
             # An unloaded condyle has no contact: its values are zero.
             condyle = getattr(result, side)
             values[k, i] = 0.0 if condyle is None else getattr(condyle, name)
-        if result.status is ContactStatus.OUT_OF_RANGE:
+        if result.failed:
             values[k] = np.nan
     return values
 

@@ -96,8 +96,8 @@ def force_derivatives(
 ) -> tuple[Array, Array]:
     """Return the result of `Knee.external_forces_derivatives`."""
     twists = relative_twists(knee, q, data)
-    kinematics = knee.at(q, data, v)
-    muscle_tensions = knee.checked_tensions(tensions)
+    kinematics = knee._kinematics(data, q, v)
+    muscle_tensions = knee._tensions(tensions)
     wrenches, by_q, by_v = _between(knee, data, kinematics, twists, q, v)
     beside, slopes = _beside(knee, data, kinematics, muscle_tensions, twists)
     for link, wrench in beside.items():
@@ -114,7 +114,7 @@ def force_derivatives(
             change = change - force_cross(twist, wrench)
         df_dq[joint] += to_joint @ change
         df_dv[joint] += to_joint @ rate
-    for name, line in knee.muscle_lines.items():
+    for name, line in knee._lines.items():
         if tension := muscle_tensions.get(name, 0.0):
             line.add_derivatives(knee.model, data.data, tension, df_dq)
     return df_dq, df_dv
@@ -180,10 +180,10 @@ def _between(
     """
     on_insert, by_q = np.zeros(6), np.zeros((6, knee.model.nv))
     by_v, femur = np.zeros_like(by_q), _users(knee, twists.femur)
-    stiffness = knee.crossing_stiffness(kinematics)
+    stiffness = knee._crossing_stiffness(kinematics)
     if knee.contact is not None:
         twist = knee.bridge.twist(data.data)
-        contact = knee.contact_at(data, kinematics)
+        contact = knee._contact_at(data, kinematics)
         on_insert += knee.contact.wrench(contact, twist)
         stiffness = stiffness + knee.contact.stiffness(
             data.probe, kinematics.pose, contact, twist, True
@@ -193,8 +193,8 @@ def _between(
             by_v = damping @ femur
             if np.any(v):
                 by_q = damping @ _users(knee, twist_derivative(knee, data.data, twists.femur, q, v))
-    if knee.crossing is not None:
-        on_insert += knee.crossing.wrench(kinematics.pose)
+    if knee._crossing is not None:
+        on_insert += knee._crossing.wrench(kinematics.pose)
     # Action and reaction: the femur's wrench is the opposite of the tibia's.
     by_q = by_q + stiffness @ femur
     zero = np.zeros(6), np.zeros_like(by_q), np.zeros_like(by_q)
@@ -266,9 +266,9 @@ def _beside(
 
     These are the extensor mechanism and the ligaments that end on the patella.
     """
-    if not knee.loads_patella(tensions):
+    if not knee._loads_patella(tensions):
         return {}, {}
-    patella = knee.patella_at(kinematics, data) if knee.extensor_lines is not None else None
+    patella = knee._find_patella(kinematics, data) if knee.extensor_lines is not None else None
     by_pose, by_patella, wrenches = _slopes_beside(knee, kinematics, patella, tensions)
     femur = _users(knee, twists.femur)
     slopes = {link: by_pose[link] @ femur for link in LINKS}
@@ -290,7 +290,7 @@ def _slopes_beside(
     """Return link -> derivative by the pose (6, 6), by the patella (6, 3), and wrench (6,)."""
 
     def total(pose: Array, state: "PatellaState | None") -> Array:
-        loads = summed(knee.loads_beside(replace(kinematics, pose=pose), state, tensions))
+        loads = summed(knee._loads_beside(replace(kinematics, pose=pose), state, tensions))
         return np.concatenate([loads.get(link, np.zeros(6)) for link in LINKS])
 
     if patella is None:

@@ -17,7 +17,7 @@ from tkamb.knee.chain import Chain
 from tkamb.knee.equations import Extensor
 from tkamb.knee.load import PointForces, scaled
 from tkamb.knee.muscles import Line, Muscle, PatellarLigament, Wrap, muscle_line, off_femur
-from tkamb.knee.patella import ExtensorMechanism, PatellaState, patella_at
+from tkamb.knee.patella import ExtensorMechanism, PatellaFrame, PatellaState, patella_at
 from tkamb.knee.patella_search import solve_patella
 from tkamb.knee.patellofemoral import PatellarContact, PatellofemoralContact
 from tkamb.knee.unknowns import Unknown, muscle_load
@@ -277,6 +277,7 @@ class ExtensorFrames:
     ) -> None:
         self.lines = lines
         self._contacts: _RecordedContacts | None = None
+        self._equilibria: dict[int, tuple[PatellaState, float]] = {}
         self.states: Sequence[PatellaState]
         if recorded is not None:
             self._joints = recorded
@@ -286,27 +287,64 @@ class ExtensorFrames:
             self.states = _solve_all(lines.mechanism, poses)
             self._joints = self._differentiate(time, poses, rates)
 
-    def moved(self, lines: ExtensorLines, poses: Array, frames: Sequence[int]) -> "ExtensorFrames":
-        """Return a solved patella for slightly changed lines or poses of the femur.
+    def moved(
+        self,
+        lines: ExtensorLines,
+        poses: Array,
+        frames: Sequence[int],
+        recorded: Array | None = None,
+    ) -> "ExtensorFrames":
+        """Return the patella for slightly changed lines or poses of the femur.
 
-        In the given frames the patella is solved again, with its last position as initial guess.
-        The rates and all other frames do not change.
+        In the given frames the equilibrium is solved again, with the last one as initial guess. A
+        solved patella moves there. A recorded patella moves from the recorded coordinates by the
+        change of the equilibrium: its distance from the equilibrium stays that of the recording. It
+        is lost if one of the two equilibria does not exist. The rates and all other frames do not
+        change.
 
         Args:
             lines: the changed mechanism.
             poses: changed pose_femur_in_insert, shape (f, 4, 4).
-            frames: frames in which the patella is solved again.
+            frames: frames in which the patella moves.
+            recorded: recorded coordinates, possibly changed, shape (f, 3), m and rad; None: the
+                patella is solved.
         """
         other = copy.copy(self)
-        other.lines = lines
-        states, other._joints = list(self.states), self._joints.copy()
+        other.lines, other._joints = lines, self._joints.copy()
+        if recorded is not None:
+            other._joints[:, 0] = recorded
+        solutions = {}
         for k in frames:
-            state = self.states[k]
-            solution = solve_patella(lines.mechanism, poses[k], state.coordinates, state.slopes)
-            states[k] = solution
+            state, length = self._equilibrium(k)
+            mechanism = replace(lines.mechanism, ligament_length=length)
+            solution = solve_patella(mechanism, poses[k], state.coordinates, state.slopes)
             other._joints[k, 0] += solution.coordinates - state.coordinates
-        other.states = states
+            solutions[k] = solution if state.status.found else state
+        if recorded is None:
+            other.states = [solutions.get(k, state) for k, state in enumerate(self.states)]
+            return other
+        coordinates = np.ascontiguousarray(other._joints[:, 0])
+        lost = {k: state for k, state in solutions.items() if not state.status.found}
+        other._contacts = _RecordedContacts(lines.prepared.unused(), coordinates)
+        other.states = _RecordedStates(lines.mechanism, poses, other._contacts, lost)
         return other
+
+    def _equilibrium(self, k: int) -> tuple[PatellaState, float]:
+        """Return the patella in equilibrium in frame k, and the length of the ligament, m.
+
+        A ligament without a given length has that of the recorded pose.
+        """
+        mechanism, states = self.lines.mechanism, self.states
+        if not isinstance(states, _RecordedStates):
+            return states[k], mechanism.ligament_length
+        if k not in self._equilibria:
+            length = mechanism.ligament_length
+            if np.isnan(length):
+                length = states.ligament_length(k)
+                mechanism = replace(mechanism, ligament_length=length)
+            found = solve_patella(mechanism, states.poses[k], self._joints[k, 0])
+            self._equilibria[k] = found, length
+        return self._equilibria[k]
 
     def joints(self, k: int) -> Array:
         """Return patella coordinates, rates and accelerations (3, 3) of frame k; NaN if lost."""
@@ -323,9 +361,11 @@ class ExtensorFrames:
         guess is `guess` or the patella at the recorded pose.
         """
         mechanism = self.lines.mechanism
+        frame_state = self.states[k]
+        if self._contacts is not None and not frame_state.status.found:
+            return frame_state
         if self._contacts is not None:
             return patella_at(mechanism, pose, self._contacts.coordinates[k], self._contacts[k])
-        frame_state = self.states[k]
         if guess is not None and frame_state.status.found:
             # If the search from a distant guess fails, the search from the solution at the recorded
             # pose may converge.
@@ -441,16 +481,29 @@ def _recorded_contacts(prepared: PatellofemoralContact, coordinates: bytes) -> _
 
 
 class _RecordedStates(Sequence[PatellaState]):
-    """The recorded patella at the recorded poses of the femur (f, 4, 4)."""
+    """The recorded patella at the recorded poses of the femur (f, 4, 4).
+
+    `lost` has the states of the frames in which a sample has no patella.
+    """
 
     def __init__(
-        self, mechanism: ExtensorMechanism, poses: Array, contacts: _RecordedContacts
+        self,
+        mechanism: ExtensorMechanism,
+        poses: Array,
+        contacts: _RecordedContacts,
+        lost: Mapping[int, PatellaState] | None = None,
     ) -> None:
-        self._mechanism, self._poses, self._contacts = mechanism, poses, contacts
-        self._cache: dict[int, PatellaState] = {}
+        self._mechanism, self.poses, self._contacts = mechanism, poses, contacts
+        self._cache = dict(lost or {})
+
+    def ligament_length(self, k: int) -> float:
+        """Return the length of the ligament's path in frame k, m."""
+        frame = PatellaFrame(self._mechanism, self.poses[k])
+        coordinates, contact = self._contacts.coordinates[k], self._contacts[k]
+        return float(frame.balance_at(coordinates, contact).ligament.length)
 
     def __len__(self) -> int:
-        return len(self._poses)
+        return len(self.poses)
 
     @overload
     def __getitem__(self, k: int) -> PatellaState: ...
@@ -462,7 +515,7 @@ class _RecordedStates(Sequence[PatellaState]):
         k = range(len(self))[k]
         if k not in self._cache:
             coordinates, contact = self._contacts.coordinates[k], self._contacts[k]
-            self._cache[k] = patella_at(self._mechanism, self._poses[k], coordinates, contact)
+            self._cache[k] = patella_at(self._mechanism, self.poses[k], coordinates, contact)
         return self._cache[k]
 
 

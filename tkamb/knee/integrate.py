@@ -52,7 +52,7 @@ def implicit_step(
     v: Array,
     step: float,
     tau: Array | None = None,
-    external: Any = None,
+    fext: Any = None,
     tensions: Mapping[str, float] | None = None,
     theta: float = 0.5,
     friction_of_joints: Array | None = None,
@@ -67,7 +67,7 @@ def implicit_step(
         v: velocity, shape (nv,).
         step: time step, s.
         tau: torques and forces of the joints, shape (nv,), N·m and N; None: zero.
-        external: external forces on the joints, as `fext` of `pin.aba`; None: zero.
+        fext: external forces on the joints, as `fext` of `pin.aba`; None: zero.
         tensions: muscle -> tension, N, as for `Knee.external_forces`.
         theta: 0.5: implicit midpoint; 1: implicit Euler.
         friction_of_joints: viscous friction of the joints, shape (nv,), N·s/m or N·m·s/rad; None:
@@ -96,8 +96,8 @@ def implicit_step(
             v_end = v_end - change
             continue
         knee_forces = forces
-        if external is not None:
-            forces = pin.StdVec_Force([f + e for f, e in zip(forces, external, strict=True)])
+        if fext is not None:
+            forces = pin.StdVec_Force([f + e for f, e in zip(forces, fext, strict=True)])
         torque = torques - viscosity * v_middle
         # Residual of the equation for the velocity at the end of the step.
         residual = v_end - v - step * pin.aba(model, cache, q_middle, v_middle, torque, forces)

@@ -9,7 +9,6 @@ prints nothing, and does not change the result of the next call.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,10 +28,13 @@ from tkamb.knee.equations import KneeGeometry
 from tkamb.knee.instant import Instant, PatellaAt, PatellaFinder, SharingMuscles
 from tkamb.knee.load import PointForces
 from tkamb.knee.loads import KneeLoads, knee_loads
+from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.contact.model import ProbedContact
-    from tkamb.contact.result import ContactResult, Guess, WarmStart
+    from tkamb.contact.result import ContactResult, WarmStart
+    from tkamb.knee.balance import BalanceStatus
+    from tkamb.knee.pressed import KneeContactResult
     from tkamb.knee.released import KneeEquilibrium
     from tkamb.knee.solution_derivatives import EquilibriumDerivatives, PressDerivatives
 
@@ -43,27 +45,53 @@ class Equilibrium:
 
     Args:
         q: configuration of the user's model in equilibrium, shape (nq,).
-        coordinates: knee coordinates in equilibrium, shape (6,), m and rad. The coordinates of a
-            left knee are those of its mirror image.
+        coordinates: knee coordinates in equilibrium, as `Knee.coordinates`, shape (6,), m and rad.
         loads: loads of the knee in equilibrium.
-        contact: the contact in equilibrium; None: no equilibrium.
+        contact: the contact in equilibrium, as `Knee.evaluate`; None: no equilibrium.
         residual: largest residual force on a released coordinate, N (moments divided by 25 mm).
         stiffness: stiffness of the n released coordinates, shape (n, n), N/m (rotations times
             25 mm).
-        problem: reason why there is no equilibrium; empty: there is an equilibrium.
-        search: details of the search.
+        reason: why there is no equilibrium, in a sentence; empty: there is an equilibrium.
+        search: details of the search, which is that of a right knee.
         derivatives: derivatives of the equilibrium; None: not asked for, or no equilibrium.
     """
 
     q: Array
     coordinates: Array
     loads: KneeLoads
-    contact: "ContactResult | None"
+    contact: "KneeContactResult | None"
     residual: float
     stiffness: Array
-    problem: str
+    reason: str
     search: "KneeEquilibrium"
     derivatives: "EquilibriumDerivatives | None" = None
+
+    @property
+    def failed(self) -> bool:
+        """Whether there is no equilibrium."""
+        return bool(self.reason)
+
+    @property
+    def status(self) -> "BalanceStatus":
+        """How the search ended."""
+        return self.search.balance.status
+
+    def __repr__(self) -> str:
+        """Return pose, forces and residual in three lines."""
+        if self.failed:
+            return f"<tkamb.Equilibrium: failed: {self.reason}>"
+        millimetres = self.coordinates[:3] / MILLIMETRE
+        degrees = self.coordinates[3:] / DEGREE
+        places = [
+            f"{name} {value:.3g} {unit}"
+            for name, value, unit in zip(
+                KNEE_COORDINATES, (*millimetres, *degrees), ["mm"] * 3 + ["deg"] * 3, strict=True
+            )
+        ]
+        forces = ", ".join(f"{side} {f:.0f} N" for side, f in self.loads.normal_force.items())
+        return (
+            f"<tkamb.Equilibrium: {', '.join(places)};\n  {forces}; residual {self.residual:.2g} N>"
+        )
 
 
 class Knee(AssembledKnee):
@@ -94,13 +122,27 @@ class Knee(AssembledKnee):
             another knee with the same implant; None: no contact.
         friction: Coulomb coefficient of the femorotibial contact.
         muscles: straight lines of given tension between any frames of the model.
-        frames: part of the knee -> name of its frame in the model.
+        frames: part of the knee -> name of its frame in the model; None: the part's default. A
+            joint's frame is not taken for a part unless it is named here.
         joints: expected names of the joints between tibia and femur; empty: no check.
         cache: whether a lattice stores its prepared operators on disk for later runs.
 
     Raises:
         InputError: the arguments do not fit together.
     """
+
+    def __repr__(self) -> str:
+        """Return side, model, contact and lines in three lines."""
+        contact = "no contact"
+        if self.contact is not None:
+            model = self.contact.model
+            contact = f"{model.name} at {getattr(model, 'resolution', 0.0) / MILLIMETRE:g} mm"
+        lines = f"{len(self.ligaments)} ligaments, {len(self._lines)} muscles"
+        return (
+            f"<tkamb.Knee: {self.side} knee on '{self.model.name}' (nq {self.model.nq}, nv "
+            f"{self.model.nv})\n  {contact}, friction {self.friction:g}\n  {lines}, "
+            f"{'no ' if self.extensor is None else ''}extensor mechanism>"
+        )
 
     def external_forces(
         self,
@@ -130,15 +172,16 @@ class Knee(AssembledKnee):
             InputError: q or v has the wrong size, or a muscle is unknown.
             ComputationError: the contact model is out of its range, or the patella is not found.
         """
-        data = self.create_data() if data is None else data
+        data = self._data(data)
         if np.ndim(q) == 2:
             from tkamb.knee.batches import forces_of_all
 
             return forces_of_all(self, q, v, tensions, data)
         kinematics = self._kinematics(data, q, v)
+        self._check_place(kinematics.pose)
         on_insert = np.zeros(6)
         if self.contact is not None:
-            contact = self.contact_at(data, kinematics)
+            contact = self._contact_at(data, kinematics)
             on_insert = self.contact.wrench(contact, self.bridge.twist(data.data))
         if self._crossing is not None:
             on_insert = on_insert + self._crossing.wrench(kinematics.pose)
@@ -152,10 +195,10 @@ class Knee(AssembledKnee):
         self, data: KneeData, kinematics: KneePose, muscle_tensions: Mapping[str, float]
     ) -> list[PointForces]:
         """Return the loads of the extensor mechanism, and of ligaments that end on the patella."""
-        if not self.loads_patella(muscle_tensions):
+        if not self._loads_patella(muscle_tensions):
             return []
         patella = None if self.extensor_lines is None else self._find_patella(kinematics, data)
-        return self.loads_beside(kinematics, patella, muscle_tensions)
+        return self._loads_beside(kinematics, patella, muscle_tensions)
 
     def condyle_forces(self, q: Array, data: KneeData | None = None) -> tuple[Array, Array]:
         """Return the contact forces (2,), N, of medial and lateral condyle, and their derivative.
@@ -167,10 +210,10 @@ class Knee(AssembledKnee):
             InputError: the knee has no contact model, or the model has no exact tangent.
             ComputationError: the contact model is out of its range.
         """
-        contact, data = self._need_contact(), self.create_data() if data is None else data
+        contact, data = self._need_contact(), self._data(data)
         twists = self.relative_jacobian(q, data)
         twists = mirrored_spatial(twists.T).T if self.left else twists
-        probed = self.contact_at(data, self.at(q, data))
+        probed = self._contact_at(data, self._kinematics(data, q))
         if not (probed.tangent and probed.exact):
             raise InputError(f"{contact.model.name} has no exact tangent", "condyle_forces")
         forces, slopes = np.zeros(2), np.zeros((2, self.model.nv))
@@ -200,14 +243,14 @@ class Knee(AssembledKnee):
         Raises:
             ComputationError: the contact model is out of its range.
         """
-        data = self.create_data() if data is None else data
+        data = self._data(data)
         kinematics = self._kinematics(data, q, v)
         total = np.zeros((6, 6))
         if self.contact is not None:
             twist = self.bridge.twist(data.data)
-            contact = self.contact_at(data, kinematics)
+            contact = self._contact_at(data, kinematics)
             total += self.contact.stiffness(data.probe, kinematics.pose, contact, twist, exact)
-        total += self.crossing_stiffness(kinematics)
+        total += self._crossing_stiffness(kinematics)
         return self._mirrored_matrix(total)
 
     def damping(self, q: Array, v: Array, data: KneeData | None = None) -> Array:
@@ -216,11 +259,11 @@ class Knee(AssembledKnee):
         The twist is the velocity of the femur relative to the insert (m/s, rad/s), in the
         conventions of `stiffness`. Only friction depends on the velocity.
         """
-        data = self.create_data() if data is None else data
+        data = self._data(data)
         kinematics = self._kinematics(data, q, v)
         if self.contact is None:
             return np.zeros((6, 6))
-        contact = self.contact_at(data, kinematics)
+        contact = self._contact_at(data, kinematics)
         return self._mirrored_matrix(self.contact.damping(contact, self.bridge.twist(data.data)))
 
     def external_forces_derivatives(
@@ -252,7 +295,7 @@ class Knee(AssembledKnee):
         """
         from tkamb.knee.derivatives import force_derivatives
 
-        return force_derivatives(self, q, v, tensions, self.create_data() if data is None else data)
+        return force_derivatives(self, q, v, tensions, self._data(data))
 
     def forward_dynamics(
         self,
@@ -277,7 +320,7 @@ class Knee(AssembledKnee):
             InputError: see `external_forces`.
             ComputationError: see `external_forces`.
         """
-        data = self.create_data() if data is None else data
+        data = self._data(data)
         forces = self._with_external(self.external_forces(q, v, tensions, data), fext)
         return np.array(pin.aba(self.model, data.data, q, v, self._check_tau(tau), forces))
 
@@ -300,7 +343,7 @@ class Knee(AssembledKnee):
         """
         from tkamb.knee.derivatives import generalised
 
-        data = self.create_data() if data is None else data
+        data = self._data(data)
         model, pin_data = self.model, data.data
         forces = self._with_external(self.external_forces(q, v, tensions, data), fext)
         by_q, by_v = self.external_forces_derivatives(q, v, tensions, data)
@@ -344,7 +387,7 @@ class Knee(AssembledKnee):
         """
         from tkamb.knee.derivatives import generalised
 
-        data = self.create_data() if data is None else data
+        data = self._data(data)
         model, pin_data = self.model, data.data
         forces = self._with_external(self.external_forces(q, v, tensions, data), fext)
         by_q, by_v = self.external_forces_derivatives(q, v, tensions, data)
@@ -357,7 +400,7 @@ class Knee(AssembledKnee):
     def _with_external(self, forces: Any, fext: Any) -> Any:
         if fext is None:
             return forces
-        self._check_external(fext)
+        self._check_fext(fext)
         return pin.StdVec_Force([f + e for f, e in zip(forces, fext, strict=True)])
 
     def _check_tau(self, tau: Array) -> Array:
@@ -368,7 +411,7 @@ class Knee(AssembledKnee):
         q: Array,
         v: Array,
         a: Array,
-        external: Any = None,
+        fext: Any = None,
         tensions: Mapping[str, float] | None = None,
         contact: "ContactResult | None" = None,
         data: KneeData | None = None,
@@ -383,8 +426,8 @@ class Knee(AssembledKnee):
             q: configuration, shape (nq,).
             v: velocity, shape (nv,).
             a: acceleration, shape (nv,).
-            external: ground reaction and all other external forces on the joints, each in its
-                joint's frame, as `fext` of `pin.rnea`; None: zero.
+            fext: ground reaction and all other external forces on the joints, each in its joint's
+                frame, as `fext` of `pin.rnea`; None: zero.
             tensions: muscle of `muscles` -> tension, N. The tension of the quadriceps is unknown
                 and cannot be given.
             contact: a contact from `press` or `evaluate`; None: closest points.
@@ -395,18 +438,21 @@ class Knee(AssembledKnee):
 
         Raises:
             InputError: an argument has the wrong size, a muscle is unknown, or a contact is given
-                to a knee without a contact model.
+                to a knee without a contact model, or is that of a knee of the other side.
         """
-        data = self.create_data_for_kinematics() if data is None else data
-        instant = self.instant(q, v, a, external, tensions, data)
+        data = self._data(data, contact=False)
+        instant = self._instant(q, v, a, fext, tensions, data)
+        self._check_place(knee_pose(instant.coordinates))
         geometry, points = instant.geometry(), NO_CONTACT
         if contact is not None:
             from tkamb.contact.model import condyle_wrenches
+            from tkamb.knee.pressed import contact_of_equations
 
-            wrenches = condyle_wrenches(contact, self._need_contact().pair.split)
+            pressed = contact_of_equations(contact, self.left)
+            wrenches = condyle_wrenches(pressed, self._need_contact().pair.split)
             geometry = instant.touching(geometry, instant.coordinates, wrenches, {})
         elif self.contact is not None:
-            points = instant.contact_points(self.query, knee_pose(instant.coordinates))
+            points = instant.contact_points(self._query, knee_pose(instant.coordinates))
             geometry = replace(geometry, condyles=points.condyles, lifted=points.lifted)
         geometry = replace(geometry, problems=points.problems + geometry.problems)
         return self._solved(instant, geometry, data)
@@ -415,7 +461,7 @@ class Knee(AssembledKnee):
         self,
         q: Array,
         load: float | Array,
-        guess: "Guess | None" = None,
+        data: KneeData | None = None,
         derivatives: bool = False,
     ) -> Any:
         """Return the contact under a load, at the rotations, AP and ML of q.
@@ -423,74 +469,81 @@ class Knee(AssembledKnee):
         Args:
             q: configuration, shape (nq,); or (n, nq) for n poses.
             load: compressive force along the insert's y axis, 0 or more, N; or one per pose, (n,).
-            guess: an earlier result or a warm start, to save time.
+            data: data from `create_data`; the last contact is the warm start.
             derivatives: whether the derivatives by load and pose are returned, too.
 
         Returns:
-            A `ContactResult`: pressure, area and forces of both condyles, in the insert frame of a
-            right knee: a left knee is computed as its mirror image (z to -z). With derivatives, it
-            and `tkamb.knee.solution_derivatives.PressDerivatives`. For n poses a
+            A `tkamb.knee.pressed.KneeContactResult`: pressure, area and forces of both condyles in
+            the insert frame. With derivatives, it and
+            `tkamb.knee.solution_derivatives.PressDerivatives`. For n poses a
             `tkamb.knee.batches.PressBatch`.
 
         Raises:
             InputError: the knee has no contact model, the load is negative or not finite, or
                 derivatives are asked of a contact model without an exact tangent.
         """
+        from tkamb.knee.pressed import contact_of_user
+
+        data = self._data(data, contact=False)
         if np.ndim(q) == 2:
             from tkamb.knee.batches import press_all
 
-            return press_all(self, q, load, guess, derivatives)
-        result, start = self.press_from(q, float(load), guess)
-        return (result, self.press_slopes(result, start)) if derivatives else result
+            return press_all(self, q, load, data, derivatives)
+        result, start = self._press_from(q, float(load), data)
+        of_user = contact_of_user(result, self.left)
+        return (of_user, self._press_slopes(result, start)) if derivatives else of_user
 
-    def press_slopes(self, result: "ContactResult", start: "WarmStart") -> "PressDerivatives":
-        """Return the derivatives of a press from its result and warm start.
-
-        Raises:
-            InputError: the contact model has no exact tangent.
-            ComputationError: the press failed.
-        """
+    def _press_slopes(self, result: "ContactResult", start: "WarmStart") -> "PressDerivatives":
+        """Return the derivatives of a press from its result in the equations and its warm start."""
         from tkamb.knee.solution_derivatives import exact_tangent, press_derivatives
 
         contact = self._need_contact()
-        if result.status.value == "out_of_range":
-            raise ComputationError("; ".join(result.flags), "press")
+        if result.failed:
+            raise ComputationError(result.reason, "press")
         probed = contact.probe(start).seen(result, start)
         exact_tangent(probed, contact.model.name)
         slopes = press_derivatives(contact.pair, result.pose, probed)
         return replace(slopes, by_pose=mirrored_spatial(slopes.by_pose)) if self.left else slopes
 
-    def press_from(
-        self, q: Array, load: float, start: "Guess | None" = None
+    def _press_from(
+        self, q: Array, load: float, data: KneeData
     ) -> "tuple[ContactResult, WarmStart]":
-        """Return the result of `press`, and a warm start for the next press at a similar pose.
-
-        Args:
-            q: configuration, shape (nq,).
-            load: load of `press`, N.
-            start: warm start of the last press, to save time.
-        """
+        """Return the contact of the equations and its warm start, which `data` stores, too."""
         contact = self._need_contact()
         if not (np.isfinite(load) and load >= 0):
             raise InputError(f"load {load} N", "press", "give a load of 0 or more")
-        kinematics = self._kinematics(self.create_data_for_kinematics(), q)
-        return contact.model.press_from(contact.state, float(load), kinematics.pose, start)
+        pose = self._kinematics(data, q).pose
+        result, start = contact.model.press_from(contact.state, float(load), pose, data.start)
+        # A failed press has no pressures to start from.
+        if not result.failed:
+            data.start = start
+        return result, start
 
-    def evaluate(self, q: Array, guess: "Guess | None" = None) -> "ContactResult":
+    def evaluate(self, q: Array, data: KneeData | None = None) -> "KneeContactResult":
         """Return the contact at q: pressure, area and forces from the overlap of the bodies.
 
         The result has the form of `press`, but the height of the femur is that of q.
+
+        Args:
+            q: configuration, shape (nq,).
+            data: data from `create_data`; the last contact is the warm start.
         """
-        contact = self._need_contact()
-        kinematics = self._kinematics(self.create_data_for_kinematics(), q)
-        return contact.model.evaluate(contact.state, kinematics.pose, guess)
+        from tkamb.knee.pressed import contact_of_user
+
+        contact, data = self._need_contact(), self._data(data, contact=False)
+        pose = self._kinematics(data, q).pose
+        self._check_place(pose)
+        result = contact.model.evaluate(contact.state, pose, data.start)
+        if not result.failed:
+            data.start = result
+        return contact_of_user(result, self.left)
 
     def equilibrium(
         self,
         q: Array,
         v: Array,
         a: Array,
-        external: Any = None,
+        fext: Any = None,
         released: Sequence[str] = ("ap", "ml", "axial_rotation", "adduction"),
         tensions: Mapping[str, float] | None = None,
         data: KneeData | None = None,
@@ -506,7 +559,7 @@ class Knee(AssembledKnee):
             q: configuration, the initial guess, shape (nq,).
             v: velocity, shape (nv,).
             a: acceleration, shape (nv,).
-            external: external forces, see `inverse_dynamics`.
+            fext: external forces, see `inverse_dynamics`.
             released: some of "ap", "ml", "axial_rotation", "adduction"; "si" is always released.
             tensions: muscle tensions, see `inverse_dynamics`.
             data: data from `create_data`, to save time.
@@ -520,18 +573,19 @@ class Knee(AssembledKnee):
                 asked of a contact model without an exact tangent.
             ComputationError: the femur does not lie over the insert.
         """
+        from tkamb.knee.pressed import contact_of_user
         from tkamb.knee.released import ReleasedKnee
 
         contact, allowed = self._need_contact(), [n for n in KNEE_COORDINATES if n != "flexion"]
         for name in released:
             if name not in allowed:
                 raise InputError(f"no coordinate '{name}'", "released", names_near(name, allowed))
-        data = self.create_data() if data is None else data
-        instant = self.instant(q, v, a, external, tensions, data)
+        data = self._data(data)
+        instant = self._instant(q, v, a, fext, tensions, data)
         probe = data.probe if data.probe is not None else contact.probe()
         search = ReleasedKnee(probe, released)
-        points = {} if len(search.released) == 5 else self.nearest_points(instant.coordinates)
-        knee = self._knee_in_equilibrium(search, instant, points)
+        points = {} if len(search.released) == 5 else self._nearest_points(instant.coordinates)
+        knee, sign = self._knee_in_equilibrium(search, instant, points), self._coordinate_signs
         result, q_end = None, np.array(q, float)
         geometry = replace(knee.geometry, problems=(knee.problem,))
         if not knee.problem:
@@ -545,13 +599,14 @@ class Knee(AssembledKnee):
         slopes = None
         if derivatives and not knee.problem:
             slopes = self._equilibrium_derivatives(search, instant, knee, points)
+        released_signs = sign[list(search.released)]
         return Equilibrium(
             q_end,
-            knee.coordinates,
+            sign * knee.coordinates,
             loads,
-            result,
+            None if result is None else contact_of_user(result, self.left),
             knee.residual,
-            knee.balance.stiffness,
+            released_signs[:, None] * knee.balance.stiffness * released_signs,
             knee.problem,
             knee,
             slopes,
@@ -560,13 +615,23 @@ class Knee(AssembledKnee):
     def _equilibrium_derivatives(
         self, search: Any, instant: Instant, knee: "KneeEquilibrium", points: dict[str, Array]
     ) -> "EquilibriumDerivatives":
-        from tkamb.knee.solution_derivatives import ImplicitEquilibrium, exact_tangent
+        from tkamb.knee.solution_derivatives import (
+            EquilibriumDerivatives,
+            ImplicitEquilibrium,
+            exact_tangent,
+        )
 
         exact_tangent(knee.contact, self._need_contact().model.name)
         slopes = ImplicitEquilibrium(search, instant, knee, points).derivatives()
         if self.left:
-            # Coordinates are those of the mirror image; the load is in the user's frame.
-            slopes = replace(slopes, by_load=mirrored_spatial(slopes.by_load))
+            signs = self._coordinate_signs
+            rows = np.append(signs, [1.0, 1.0])[:, None]
+            slopes = EquilibriumDerivatives(
+                rows * mirrored_spatial(slopes.by_load),
+                rows * slopes.by_coordinate * signs,
+                rows * slopes.by_slack_length,
+                rows * slopes.by_stiffness,
+            )
         return slopes
 
     def show(self, viewer: Any, q: Array, **options: Any) -> None:
@@ -579,31 +644,12 @@ class Knee(AssembledKnee):
 
         show_knee(self, viewer, q, **options)
 
-    def live(self, q: Array, load: float = 1000.0, folder: Any = None) -> Any:
-        """Serve a page on which a user moves and loads the knee by hand (docs/live.md).
-
-        The load acts along the insert's y axis, in addition to the ligaments between femur and
-        tibia. The page does not change this object.
-
-        Args:
-            q: configuration, shape (nq,), or (f, nq) for the slider "recorded frame".
-            load: first value of the load, N.
-            folder: folder for saved scenes; None: out/live.
-
-        Returns:
-            The server. Its address is `url`; it runs until `close()`.
-
-        Raises:
-            InputError: the contact model is missing, or `tkamb.contact_model` did not make it.
-        """
-        return import_module("tkamb.show.view.live_window").live_knee(self, q, load, folder)
-
-    def instant(
+    def _instant(
         self,
         q: Array,
         v: Array,
         a: Array,
-        external: Any = None,
+        fext: Any = None,
         tensions: Mapping[str, float] | None = None,
         data: KneeData | None = None,
         patella: PatellaFinder | None = None,
@@ -615,7 +661,7 @@ class Knee(AssembledKnee):
             q: configuration, shape (nq,).
             v: velocity, shape (nv,).
             a: acceleration, shape (nv,).
-            external: external forces, see `inverse_dynamics`.
+            fext: external forces, see `inverse_dynamics`.
             tensions: muscle tensions, see `inverse_dynamics`.
             data: data from `create_data`, to save time.
             patella: object that finds the patella; None: the patella of q, or its equilibrium if q
@@ -625,10 +671,10 @@ class Knee(AssembledKnee):
         Raises:
             InputError: an argument has the wrong size, or a muscle is unknown.
         """
-        data = self.create_data_for_kinematics() if data is None else data
-        q = self._check(q, "q", self.model.nq)
+        data = self._data(data, contact=False)
+        q = self._check_q(q)
         v, a = self._check(v, "v", self.model.nv), self._check(a, "a", self.model.nv)
-        self._check_external(external)
+        self._check_fext(fext)
         muscle_tensions = self._tensions(tensions)
         if self._pulls(muscle_tensions):
             raise InputError(
@@ -636,7 +682,7 @@ class Knee(AssembledKnee):
             )
         bridge, pin_data, lines = self.bridge, data.data, self.extensor_lines
         pin.forwardKinematics(self.model, pin_data, q, v, a)
-        external = self._with_lines(data, muscle_tensions, external)
+        fext = self._with_lines(data, muscle_tensions, fext)
         motion = bridge.motion(pin_data, lines is not None)
         if lines is not None and patella is None:
             patella_coordinates = None if self._finds_patella else motion.joints[0, 6:]
@@ -648,23 +694,23 @@ class Knee(AssembledKnee):
             self.chain,
             motion,
             bridge.shank_needs(pin_data),
-            bridge.external_on(self.anatomy.femur, pin_data, external),
-            bridge.external_on(self.anatomy.patella, pin_data, external),
+            bridge.external_on(self.anatomy.femur, pin_data, fext),
+            bridge.external_on(self.anatomy.patella, pin_data, fext),
             self.ligaments,
             patella,
             self.friction,
             self.contact is not None and self.contact.pair.split is not None,
-            None if external is None else bridge.on_shank(pin_data, external),
+            None if fext is None else bridge.on_shank(pin_data, fext),
             muscles,
         )
 
-    def _check_external(self, external: Any) -> None:
-        if external is not None and len(external) != self.model.njoints:
+    def _check_fext(self, fext: Any) -> None:
+        if fext is not None and len(fext) != self.model.njoints:
             raise InputError(
-                f"{len(external)} forces", "external", f"give one per joint, {self.model.njoints}"
+                f"{len(fext)} forces", "fext", f"give one per joint, {self.model.njoints}"
             )
 
-    def contact_at(self, data: KneeData, kinematics: KneePose) -> "ProbedContact":
+    def _contact_at(self, data: KneeData, kinematics: KneePose) -> "ProbedContact":
         """Return the contact at a pose. The last contact is stored in `data`."""
         key = kinematics.pose.tobytes()
         if data.seen is None or data.seen[0] != key:
@@ -672,7 +718,7 @@ class Knee(AssembledKnee):
             data.seen = key, self.contact.at(data.probe, kinematics.pose)
         return data.seen[1]
 
-    def crossing_stiffness(self, kinematics: KneePose) -> Array:
+    def _crossing_stiffness(self, kinematics: KneePose) -> Array:
         """Return the stiffness (6, 6) of the ligaments between femur and tibia."""
         if self._crossing is None:
             return np.zeros((6, 6))

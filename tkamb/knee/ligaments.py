@@ -1,14 +1,6 @@
 """Ligament bundles: straight lines between two links that pull and never push.
 
-L0 is the slack length, eps = (L - L0)/L0 the strain, and eps1 = 0.03:
-
-    two-line (k in N/m)                         quadratic toe (k_eps in N per unit strain)
-    F = 0                      eps <= 0         F = 0                        eps <= 0
-    F = (k/2) (L - L0)         eps <= 2 eps1    F = k_eps eps²/(4 eps1)      eps <= 2 eps1
-    F = k (L - (1 + eps1) L0)  otherwise        F = k_eps (eps - eps1)       otherwise
-
-Both laws are continuous. The slope of the two-line law jumps at 2 eps1; the slope of the quadratic
-toe does not.
+`tkamb.knee.ligament_laws` has the laws: tension by length.
 
 `generic_ligaments` scales a set of bundles to the implant, for a patient without measured
 ligaments. Positions of the femoral ends are relative to the axis of the posterior condyles, because
@@ -16,77 +8,35 @@ collaterals are nearly isometric near this axis. The proportions are those of an
 the strain table before using any force.
 
 References: Abdel-Rahman & Hefzy, Med Eng Phys 20:276 (1998) (stiffness); Blankevoort & Huiskes,
-J Biomech Eng 113:263 (1991), doi:10.1115/1.2894883 (law, strains at extension).
+J Biomech Eng 113:263 (1991), doi:10.1115/1.2894883 (strains at extension).
 """
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from tkamb.errors import InputError, names_near
 from tkamb.geometry.frames import Array, inverse, transform
 from tkamb.geometry.surface import Surface
 from tkamb.knee.chain import Chain
+from tkamb.knee.ligament_laws import LIGAMENT_LAWS, LigamentLaw, StackedLaws, TwoLine
 from tkamb.knee.load import LinkPoint, PointForces, wrench_of
 from tkamb.units import DEGREE, MILLIMETRE
 
 
 @dataclass(frozen=True)
 class LigamentSettings:
-    """Toe strain and reference pose of ligaments."""
+    """Reference pose of ligaments."""
 
-    toe_strain: float = 0.03
-    """1: eps1 of every ligament. The toe region ends at twice this strain. Source: Blankevoort &
-    Huiskes (1991)."""
     max_reference_distance: float = 15.0 * DEGREE
     """rad: largest difference between the reference flexion and the flexion of the nearest frame.
     Chosen because at a larger difference the strain differs."""
 
 
 LIGAMENT = LigamentSettings()
-
-
-Law = Literal["two-line", "quadratic-toe"]
-
-
-def two_line_force(length: ArrayLike, slack_length: ArrayLike, stiffness: ArrayLike) -> Array:
-    """Return the tension (N) of the two-line law; `stiffness` in N/m, lengths in m."""
-    length, slack = np.asarray(length, float), np.asarray(slack_length, float)
-    # The first line has half the slope of the second line. They meet at twice the toe strain.
-    toe = 0.5 * np.asarray(stiffness) * (length - slack)
-    line = np.asarray(stiffness) * (length - (1.0 + LIGAMENT.toe_strain) * slack)
-    strain = (length - slack) / slack
-    return np.where(strain <= 0.0, 0.0, np.where(strain <= 2.0 * LIGAMENT.toe_strain, toe, line))
-
-
-def quadratic_toe_force(length: ArrayLike, slack_length: ArrayLike, stiffness: ArrayLike) -> Array:
-    """Return the tension (N) of the quadratic-toe law; `stiffness` in N per unit strain."""
-    length, slack = np.asarray(length, float), np.asarray(slack_length, float)
-    strain = (length - slack) / slack
-    # Force and slope are continuous where the parabola meets the line, at twice the toe strain.
-    toe = np.asarray(stiffness) * strain**2 / (4.0 * LIGAMENT.toe_strain)
-    line = np.asarray(stiffness) * (strain - LIGAMENT.toe_strain)
-    return np.where(strain <= 0.0, 0.0, np.where(strain <= 2.0 * LIGAMENT.toe_strain, toe, line))
-
-
-def two_line_slope(length: ArrayLike, slack_length: ArrayLike, stiffness: ArrayLike) -> Array:
-    """Return the derivative (N/m) of `two_line_force` by the length."""
-    slack = np.asarray(slack_length, float)
-    strain = np.asarray(length, float) / slack - 1.0
-    share = np.where(strain <= 2.0 * LIGAMENT.toe_strain, 0.5, 1.0)
-    return np.where(strain <= 0.0, 0.0, share * np.asarray(stiffness))
-
-
-def quadratic_toe_slope(length: ArrayLike, slack_length: ArrayLike, stiffness: ArrayLike) -> Array:
-    """Return the derivative (N/m) of `quadratic_toe_force` by the length."""
-    slack = np.asarray(slack_length, float)
-    strain = np.asarray(length, float) / slack - 1.0
-    share = np.clip(strain / (2.0 * LIGAMENT.toe_strain), 0.0, 1.0)
-    return np.asarray(share * np.asarray(stiffness) / slack)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,21 +47,31 @@ class Ligament:
         name: name of the bundle.
         proximal: proximal end.
         distal: distal end.
-        law: force-length law, "two-line" or "quadratic-toe".
-        stiffness: stiffness, N/m for "two-line", N per unit strain for "quadratic-toe".
+        law: tension by length: `TwoLine(stiffness=...)` with N/m, `QuadraticToe(stiffness=...)`
+            with N per unit strain, or another `LigamentLaw`.
         slack_length: slack length, m; NaN: it is computed from the reference strain.
         reference_strain: strain at the reference pose, 1.
         reference_flexion: flexion of the reference pose, rad.
+
+    Raises:
+        InputError: the law is no `LigamentLaw`.
     """
 
     name: str
     proximal: LinkPoint
     distal: LinkPoint
-    law: Law
-    stiffness: float
+    law: LigamentLaw
     slack_length: float = float("nan")
     reference_strain: float = float("nan")
     reference_flexion: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.law, LigamentLaw):
+            names = LIGAMENT_LAWS.names()
+            hint = "give an object, such as law=tkamb.TwoLine(stiffness=...), stiffness in N/m"
+            if isinstance(self.law, str) and self.law not in names:
+                hint = names_near(self.law, names)
+            raise InputError(f"{self.law!r} is no law", f"ligament {self.name}", hint)
 
     def ends(self, poses: Mapping[str, Array]) -> tuple[Array, Array]:
         """Return proximal and distal end (..., 3), m, in the insert frame.
@@ -133,8 +93,7 @@ class Ligament:
 
     def force(self, length: ArrayLike) -> Array:
         """Return the tension (N), never negative, at a length (m)."""
-        law = two_line_force if self.law == "two-line" else quadratic_toe_force
-        return law(length, self.slack_length, self.stiffness)
+        return self.law.tension(length, self.slack_length)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,15 +103,13 @@ class BundleArrays:
     Args:
         proximal: proximal ends, shape (m, 3), m.
         distal: distal ends, shape (m, 3), m.
-        two_line: whether each law is "two-line", shape (m,).
-        stiffness: N/m ("two-line") or N per unit strain ("quadratic-toe"), shape (m,).
+        laws: their laws.
         slack_length: slack lengths, shape (m,), m.
     """
 
     proximal: Array
     distal: Array
-    two_line: NDArray[np.bool_]
-    stiffness: Array
+    laws: StackedLaws
     slack_length: Array
 
     @classmethod
@@ -161,8 +118,7 @@ class BundleArrays:
         return cls(
             proximal.reshape(-1, 3),
             distal.reshape(-1, 3),
-            np.array([bundle.law == "two-line" for bundle in bundles], bool),
-            np.array([bundle.stiffness for bundle in bundles], float),
+            StackedLaws.of([bundle.law for bundle in bundles]),
             np.array([bundle.slack_length for bundle in bundles], float),
         )
 
@@ -175,8 +131,7 @@ class BundleArrays:
         """
         along = proximal - distal
         length = np.linalg.norm(along, axis=-1)
-        law = (length, self.slack_length, self.stiffness)
-        tension = np.where(self.two_line, two_line_force(*law), quadratic_toe_force(*law))
+        tension = self.laws.tension(length, self.slack_length)
         return tension, (tension / length)[..., None] * along
 
     def tangent(self, pose: Array) -> Array:
@@ -192,8 +147,7 @@ class BundleArrays:
         along = proximal - self.distal
         length = np.linalg.norm(along, axis=-1)
         tension, _ = self.pulls(proximal, self.distal)
-        law = (length, self.slack_length, self.stiffness)
-        slope = np.where(self.two_line, two_line_slope(*law), quadratic_toe_slope(*law))
+        slope = self.laws.slope(length, self.slack_length)
         total, eye = np.zeros((6, 6)), np.eye(3)
         for p, d, u, t, k, size in zip(
             proximal, self.distal, along / length[:, None], tension, slope, length, strict=True
@@ -464,8 +418,7 @@ def generic_ligaments(
                     PREFIX + name,
                     LinkPoint("femur", proximal),
                     LinkPoint("tibia", distal),
-                    "two-line",
-                    bundle.stiffness_N_per_mm / MILLIMETRE,
+                    TwoLine(bundle.stiffness_N_per_mm / MILLIMETRE),
                     reference_strain=bundle.reference_strain,
                 )
             )

@@ -22,6 +22,18 @@ class LinkPoint:
     position: Array
 
 
+@dataclass(frozen=True)
+class PointSettings:
+    """Check of the unit of attachment points."""
+
+    max_distance: float = 1.0
+    """m: a point farther from its frame is refused, because it is probably in millimetres. Chosen
+    because a leg is 0.9 m long, and 1 mm is the smallest useful coordinate in millimetres."""
+
+
+POINT = PointSettings()
+
+
 Point = LinkPoint | tuple[str, Sequence[float]]
 """A point on a frame of the model: a `LinkPoint`, or the frame's name and three coordinates, m."""
 
@@ -99,5 +111,12 @@ def link_point(point: Point) -> LinkPoint:
             f"{point!r} is not a point on a frame",
             "Knee",
             "give (frame name, (x, y, z)) in metres",
+        )
+    distance = float(np.linalg.norm(coordinates))
+    if distance > POINT.max_distance:
+        raise InputError(
+            f"a point lies {distance:.4g} m from the frame '{link}'",
+            "Knee",
+            "is it in millimetres? give it in metres",
         )
     return LinkPoint(link, coordinates)

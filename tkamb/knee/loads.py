@@ -77,6 +77,26 @@ class KneeLoads:
     geometry: KneeGeometry
 
     @property
+    def failed(self) -> bool:
+        """Whether there is no solution."""
+        return bool(self.problems)
+
+    @property
+    def reason(self) -> str:
+        """Why there is no solution, in a sentence; empty: there is a solution."""
+        return "; ".join(self.problems)
+
+    def __repr__(self) -> str:
+        """Return the main forces in two lines."""
+        if self.failed:
+            return f"<tkamb.KneeLoads: failed: {self.reason}>"
+        sides = ", ".join(f"{side} {force:.0f} N" for side, force in self.normal_force.items())
+        return (
+            f"<tkamb.KneeLoads: contact {self.contact_total:.0f} N ({sides})\n"
+            f"  quadriceps {self.quadriceps:.0f} N, patellofemoral {self.patellofemoral:.0f} N>"
+        )
+
+    @property
     def contact_total(self) -> float:
         """Magnitude of the contact force, N."""
         return float(np.linalg.norm(self.contact_force))

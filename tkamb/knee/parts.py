@@ -4,6 +4,9 @@ Lengths are in metres, forces in newtons. A point on a frame of the user's model
 or a pair of the frame's name and three coordinates, such as ("femur", (0.0, 0.01, -0.042)).
 """
 
+import hashlib
+import pickle
+import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
@@ -18,12 +21,14 @@ from tkamb.knee.canonical import Bridge, se3
 from tkamb.knee.chain import Chain
 from tkamb.knee.load import link_point
 from tkamb.knee.muscles import Muscle, PatellarLigament
+from tkamb.settings import changed_settings
 
 if TYPE_CHECKING:
     import pinocchio as pin
 
     from tkamb.contact.materials import Material
     from tkamb.contact.model import ContactModel
+    from tkamb.contact.pair import ContactPair
     from tkamb.knee.contact import KneeContact
     from tkamb.knee.extensor import ExtensorLines
     from tkamb.knee.ligaments import BundleArrays, Ligament
@@ -90,15 +95,16 @@ class Extensor:
         quadriceps: muscle from the femur to the patella.
         patellar_ligament: line from the patella to the tibia. Its `length` is required if q does
             not give the pose of the patella.
-        plane: pose of the plane's frame in the frame "femur"; None: the placement of the joint
-            "patella_ap", or the frame "femur" if the model has no such joint.
+        plane: pose of the plane's frame in the frame "femur", `pin.SE3` or (4, 4); None: the
+            placement of the joint "patella_ap", or the frame "femur" if the model has no such
+            joint.
         solved: whether `Knee.equilibrium` solves the patella of the model again when the femur
             moves. False: the patella moves with the femur.
     """
 
     quadriceps: Muscle
     patellar_ligament: PatellarLigament
-    plane: "pin.SE3 | None" = None
+    plane: "pin.SE3 | Array | None" = None
     solved: bool = False
 
 
@@ -327,4 +333,32 @@ def prepared_contact(
         model = replace(model, cache=False)  # type: ignore[type-var]
     assert surfaces.femoral is not None and surfaces.insert is not None
     pair = ContactPair(surfaces.femoral, surfaces.insert, implant.insert_material, implant.bearing)
-    return KneeContact(model, pair, 0.0, model.prepare(pair))
+    key = _content(pair, model)
+    prepared = None if key is None else _PREPARED.get(key)
+    if prepared is None:
+        prepared = KneeContact(model, pair, 0.0, model.prepare(pair))
+        if key is not None:
+            _PREPARED[key] = prepared
+    return prepared
+
+
+_PREPARED: "weakref.WeakValueDictionary[str, KneeContact]" = weakref.WeakValueDictionary()
+"""Content of a contact -> the prepared contact, as long as a knee uses it."""
+
+
+def _content(pair: "ContactPair", model: "ContactModel") -> str | None:
+    """Return the SHA-256 of all that a prepared contact depends on.
+
+    These are the meshes, material and bearing, the model with its options, and changed settings.
+    None: the model cannot be pickled, so that its options are unknown.
+    """
+    parts = (model, pair.material, pair.bearing, changed_settings())
+    try:
+        digest = hashlib.sha256(pickle.dumps(parts))
+    except (pickle.PicklingError, AttributeError, TypeError):
+        return None
+    for surface in (pair.femoral, pair.insert):
+        digest.update(f"{surface.name}, {surface.vertices.shape}".encode())
+        for array in (surface.vertices, surface.faces):
+            digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()

@@ -1,5 +1,6 @@
 """The knee drawn in a user's own MeshCat window."""
 
+import weakref
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ import pinocchio as pin
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, Array, mirrored_pose, transform
 from tkamb.knee.parts import mirrored_surface
+from tkamb.knee.pressed import contact_of_equations
 
 if TYPE_CHECKING:
     from tkamb.contact.result import ContactResult
@@ -30,6 +32,14 @@ class KneeDrawingSettings:
     strand_radius: float = 8e-4
     """m: radius of ligaments, muscles and the patellar ligament. Chosen because it is easy to
     see."""
+    look_distance: float = 0.15
+    """m: distance of the camera from the knee. Chosen because the implant then fills the window."""
+    look_height: float = 0.02
+    """m: height above the insert's origin at which the camera looks. Chosen as the height of the
+    joint."""
+    look_direction: tuple[float, float, float] = (0.77, 0.40, 0.50)
+    """1: direction to the camera, insert frame of a right knee: anterior, superior, lateral. Chosen
+    because both condyles and the pressure map are in view."""
 
 
 KNEE_DRAWING = KneeDrawingSettings()
@@ -47,6 +57,7 @@ def show_knee(
     newton: float = 5e-5,
     peak: float | None = None,
     opacity: float = 0.35,
+    look: bool | None = None,
 ) -> None:
     """Draw a knee at q.
 
@@ -64,6 +75,8 @@ def show_knee(
         newton: length of an arrow per newton, m/N.
         peak: pressure of the last colour, Pa; None: the peak pressure.
         opacity: opacity of the femoral component, 0 to 1.
+        look: whether the whole drawing moves so that the knee is upright before the camera, seen
+            from anterior and lateral; None: at the first drawing in a window.
 
     Raises:
         InputError: the viewer is not a MeshCat viewer.
@@ -71,12 +84,17 @@ def show_knee(
     window, root = _window(viewer)
     tree = window[root][node] if root else window[node]
     tree.delete()
+    first = getattr(window, "window", window) not in _SEEN
     data = knee.create_data()
-    kinematics = knee.at(q, data)
+    kinematics = knee._kinematics(data, q)
     insert = data.data.oMi[knee.bridge.insert.joint] * knee.bridge.insert.placement
     world = insert.homogeneous
+    if look or (look is None and first):
+        _look_at(window, world, knee.left)
+    _SEEN.add(getattr(window, "window", window))
     if contact is None and knee.contact is not None:
         contact = knee.evaluate(q)
+    contact = None if contact is None else contact_of_equations(contact, knee.left)
     femur = kinematics.pose if contact is None else contact.pose
 
     def in_world(points: Array) -> Array:
@@ -87,7 +105,7 @@ def show_knee(
     femur_in_world = world @ to_side(femur)
     _solid(tree["femoral"], knee.femoral, femur_in_world, knee.left, "femoral", opacity)
     _solid(tree["insert"], knee.insert, world, knee.left, "insert", 0.6)
-    poses, patella = knee.link_poses(q, femur, data)
+    poses, patella = knee._drawn_links(q, femur, data)
     if patella:
         _solid(
             tree["patella"],
@@ -101,7 +119,7 @@ def show_knee(
         if {bundle.proximal.link, bundle.distal.link} <= set(poses):
             ends = np.array(bundle.ends(poses))
             _strand(tree["ligaments"][bundle.name], in_world(ends), LIGAMENT)
-    for name, path in knee.extensor_paths(poses).items():
+    for name, path in knee._extensor_paths(poses).items():
         _strand(tree["extensor"][name], in_world(path), MUSCLE)
     if contact is not None and np.isfinite(contact.pressure).all():
         _map(tree["pressure"], contact, knee.contact.state.triangles, in_world, peak)  # type: ignore[union-attr]
@@ -112,6 +130,30 @@ def show_knee(
             start = condyle.centre_of_pressure
             path = in_world(np.array([start, start - newton * force]))
             _strand(tree["force"][side], path, ARROW, KNEE_DRAWING.arrow_radius)
+
+
+_SEEN: "weakref.WeakSet[Any]" = weakref.WeakSet()
+"""Windows in which a knee was drawn."""
+
+
+def _look_at(window: Any, insert: Array, is_left: bool) -> None:
+    """Move all that Python draws so that the knee is upright before the camera.
+
+    MeshCat's camera looks at the origin of its world, with z up; no message changes this. Its grid
+    and axes, which do not move, are hidden.
+    """
+    turn = np.column_stack([np.eye(3)[0], np.eye(3)[2], -np.eye(3)[1]])  # insert x, y, z
+    view = np.eye(4)
+    view[:3, :3] = turn @ insert[:3, :3].T
+    middle = insert[:3, 3] + KNEE_DRAWING.look_height * insert[:3, 1]
+    view[:3, 3] = -view[:3, :3] @ middle
+    window["/meshcat"].set_transform(view)
+    for node in ("/Grid", "/Axes"):
+        window[node].set_property("visible", False)
+    # The camera's own axes are y up: those of the insert.
+    side = np.array([1.0, 1.0, -1.0 if is_left else 1.0])
+    place = KNEE_DRAWING.look_distance * side * np.array(KNEE_DRAWING.look_direction)
+    window["/Cameras/default/rotated/<object>"].set_property("position", place.tolist())
 
 
 def _window(viewer: Any) -> tuple[Any, str]:

@@ -11,7 +11,7 @@ and lines of the extensor mechanism are solved again at displaced poses, each fr
 """
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -206,14 +206,18 @@ class ImplicitEquilibrium:
         ]
         return np.array(columns).T
 
-    def _by_ligament(self, name: str) -> Array:
+    def _by_ligament(self, name: Literal["slack_length", "stiffness"]) -> Array:
         """Return the slopes (n, m) of the forces by a parameter of each ligament."""
         bundles, knee, columns = self._instant.ligaments, self._knee, []
         for k, bundle in enumerate(bundles):
-            value, forces = getattr(bundle, name), []
+            value, forces = getattr(bundle if name == "slack_length" else bundle.law, name), []
             size = 1e-6 * value
             for sign in (1.0, -1.0):
-                changed = replace(bundle, **{name: value + sign * size})
+                if name == "slack_length":
+                    changed = replace(bundle, slack_length=value + sign * size)
+                else:
+                    law = bundle.law.stiffened((value + sign * size) / value)
+                    changed = replace(bundle, law=law)
                 others = (*bundles[:k], changed, *bundles[k + 1 :])
                 instant = replace(self._instant, ligaments=others)
                 forces.append(self._forces(knee.coordinates, self._slack, instant))

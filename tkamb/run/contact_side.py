@@ -227,7 +227,7 @@ class ContactSide:
         begin = good[-1].start if good else None
         points = {}
         if len(released.released) < 5:
-            points = mechanics.knee.nearest_points(instant.coordinates)
+            points = mechanics.knee._nearest_points(instant.coordinates)
         try:
             knee = self.starts.equilibrium(
                 instant, [c.equilibrium for c in good if c.equilibrium], points

@@ -93,7 +93,7 @@ def press_problem(pair: ContactPair, load: float, pose: Array, grid_mm: float) -
     smooth = lattice.nodes.copy()
     smooth[nodes, 1] += surface.lift
     floor = SurfaceFromBelow(pair.femoral, pair.femoral.rays)
-    guess = contact_model("foundation", grid_mm)
+    guess = contact_model("foundation", resolution=grid_mm * MILLIMETRE)
     depth = guess.press(guess.prepare(pair), load, pose).approach
     if not depth > 0:
         raise ComputationError("needs a load that presses the bodies together", "deck")

@@ -24,7 +24,11 @@ if TYPE_CHECKING:
     from tkamb.run.results import Results
 
 
-GROUPS = {"tkamb.contact": "contact model", "tkamb.wear": "wear law"}
+GROUPS = {
+    "tkamb.contact": "contact model",
+    "tkamb.ligaments": "ligament law",
+    "tkamb.wear": "wear law",
+}
 """Group of entry points -> kind of the plug-ins of the group."""
 
 

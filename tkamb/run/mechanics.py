@@ -121,7 +121,7 @@ class Mechanics:
         self.extensor, self.muscles, self._adjustment = extensor, muscles, adjust
         self.strains = strains or {}
         self.poses = knee_pose(motion.coordinates)
-        self._data = knee.create_data_for_kinematics()
+        self._data = knee._kinematic_data()
 
     def with_contact(self, model: "ContactModel") -> "Mechanics":
         """Return the same mechanics with another contact model."""
@@ -142,12 +142,12 @@ class Mechanics:
     @property
     def query(self) -> "ClosestPointQuery | None":
         """Query of the closest points of femoral component and insert; None without contact."""
-        return None if self.knee.contact is None else self.knee.query
+        return None if self.knee.contact is None else self.knee._query
 
     def instant(self, k: int) -> Instant:
         """Return the knee at frame k."""
         motion = self.motion
-        instant = self.knee.instant(
+        instant = self.knee._instant(
             motion.q[k],
             motion.v[k],
             motion.a[k],

@@ -322,7 +322,7 @@ def press_meshes(
     """
     _check_load(load)
     settings = _adjustment_settings(adjust, restore_when)
-    model = contact_model(contact, resolution_mm, **(options or {}))
+    model = contact_model(contact, resolution=resolution_mm * MILLIMETRE, **(options or {}))
     pair, femoral_pose = load_pair(femoral, insert, units, pose, bearing, material, axes, side)
     if not math.isfinite(pair.first_touch_height(femoral_pose)):
         raise InputError(

@@ -194,7 +194,9 @@ def _knee(case: Case, shared: SharedState | None, contact: "KneeContact | None")
             material = given_material(scene.insert_material)
             pair = ContactPair(case.femoral, case.insert, material, insert.bearing)
             pair.__dict__["split"] = case.split  # computed once for case and pair
-        model = contact_model(table.model, table.resolution_mm, **table.options)
+        model = contact_model(
+            table.model, resolution=table.resolution_mm * MILLIMETRE, **table.options
+        )
         contact = KneeContact(model, pair, friction)
     if contact is not None:
         pair = contact.pair
@@ -216,7 +218,7 @@ def _check_near(case: Case, knee: Knee, poses: Array) -> None:
         return
     nearest: list[float] = []
     for k in (len(poses) // 2, 0, len(poses) - 1):
-        nearest.append(nearest_gap(knee.query.at(poses[k])))
+        nearest.append(nearest_gap(knee._query.at(poses[k])))
         if abs(nearest[-1]) <= CONTACT_POINT.max_gap:
             return
     gap = min(nearest, key=abs)
@@ -241,9 +243,10 @@ def _extensor_frames(
 
     motion, recorded = case.motion, None
     assert case.scene.patella is not None and knee.extensor_lines is not None
-    if shared is not None and case.scene.patella.motion == "solved":
+    if shared is not None:
         assert shared.extensor is not None
-        return shared.extensor.moved(knee.extensor_lines, poses, shared.frames)
+        given = motion.patella if case.scene.patella.motion == "recorded" else None
+        return shared.extensor.moved(knee.extensor_lines, poses, shared.frames, given)
     if case.scene.patella.motion == "recorded":
         if motion.patella is None:
             raise InputError(

@@ -3,9 +3,8 @@
 import csv
 import math
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
 from sys import intern
 from typing import TYPE_CHECKING, Any
@@ -18,29 +17,9 @@ from tkamb.geometry.frames import Array
 from tkamb.run.columns import KINDS, RENAMED, in_a_family, ordered_names
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from pandas import DataFrame
 
     from tkamb.run.maps import ContactMaps
-
-
-PAGES = {
-    "cohort": "tkamb.show.cohort_report:cohort_html",
-    "headline": "tkamb.show.report:headline_html",
-    "plots": "tkamb.show.plots:plot",
-    "report": "tkamb.show.report:report_html",
-}
-
-
-def page(name: str) -> Callable[..., Any]:
-    """Return the function that makes one of `PAGES`.
-
-    Raises:
-        KeyError: no such page.
-    """
-    module, _, function = PAGES[name].partition(":")
-    function_of_module: Callable[..., Any] = getattr(import_module(module), function)
-    return function_of_module
 
 
 PERCENTILES = {"p05": 5.0, "p50": 50.0, "p95": 95.0}
@@ -160,26 +139,6 @@ class Results:
         except ImportError:
             raise not_installed("pandas", "to_dataframe", "notebook") from None
         return DataFrame(self.columns)
-
-    def plot(self, *names: str, axis: str | None = None) -> "Figure":
-        """Return plots of the run in one matplotlib figure, which notebooks show.
-
-        Args:
-            names: ids of the report's plots ("forces", "condyles", "pressures", ...);
-                default: forces, condyles, ratios and pressures.
-            axis: "flexion", "cycle" or "time"; None: the axis of the scene.
-
-        Raises:
-            InputError: no such plot or axis.
-        """
-
-        figure: Figure = page("plots")(self, names, axis)
-        return figure
-
-    def _repr_html_(self) -> str:
-        """Return the report's headline numbers, for notebooks."""
-
-        return str(page("headline")(self))
 
 
 def _complete_columns(given: Mapping[str, Any]) -> dict[str, Any]:

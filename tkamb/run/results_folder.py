@@ -4,7 +4,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +30,6 @@ from tkamb.run.table_metadata import table_metadata
 
 if TYPE_CHECKING:
     from tkamb.run.maps import ContactMaps
-    from tkamb.show.panels import Panel
 
 FOLDER = ".frames"
 IDENTITY_NAME = "run.json"
@@ -128,9 +127,9 @@ def write_results(
     *,
     force: bool = False,
     more: Mapping[str, Callable[[Path], object]] | None = None,
-    progress: Callable[[Sequence["Panel"]], Iterable["Panel"]] = lambda drawn: drawn,
+    report: Callable[[Results], str] | None = None,
 ) -> None:
-    """Write results.csv, summary.json, contact.h5 and report.html: all of them or none.
+    """Write results.csv, summary.json, contact.h5 and a report.html: all of them or none.
 
     Files of an earlier run in the folder are replaced or removed, and `.frames` is removed.
 
@@ -140,13 +139,11 @@ def write_results(
         force: whether to write into a folder with files that are not tkamb's.
         more: name in `UNCERTAINTY_NAMES` -> function that writes the file at a path. Other files of
             these names are removed.
-        progress: function that wraps the plots of the report, for a progress bar.
+        report: function that returns the page report.html; None: the folder has no report.
 
     Raises:
         InputError: the folder cannot be claimed (`tkamb.io.claim`) or written.
     """
-    from tkamb.run.results import page
-
     if BANDS_NAME not in (more or {}):
         results = replace(results, bands={})  # the report must not show bands without their file
     with claimed_directory(directory, force, "run") as folder:
@@ -155,7 +152,10 @@ def write_results(
             for name, write in (more or {}).items():
                 write(files.path(name))
             put_numbers(results, files)
-            write_synced(files.path(REPORT_NAME), page("report")(results, progress))
+            if report is None:
+                files.remove(REPORT_NAME)
+            else:
+                write_synced(files.path(REPORT_NAME), report(results))
         remove_shards(folder)
 
 

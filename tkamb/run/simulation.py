@@ -180,7 +180,7 @@ Progress = Callable[[Sequence[int]], Iterable[int]]
 def simulate(
     scene: Scene | Case | str | Path,
     *,
-    contact: str | None = None,
+    contact: str | Mapping[str, Any] | None = None,
     resolution_mm: float | None = None,
     preset: str | None = None,
     frames: slice | range | None = None,
@@ -201,7 +201,8 @@ def simulate(
 
     Args:
         scene: scene, path of a scene file, or case.
-        contact: name of a contact model; None: the scene's model.
+        contact: name of a contact model, or key -> value of the table [contact]; None: the scene's
+            model.
         resolution_mm: spacing of the map points, mm; None: the scene's spacing.
         preset: name of a published study. Its choices replace those of the scene, as with
             `tkamb run --as` (`tkamb.io.presets`), except for `contact` and `resolution_mm`.
@@ -215,8 +216,7 @@ def simulate(
         workers: number of processes. With more than one, every tenth frame has no initial guess
             from the frame before, which changes results within the tolerance of the solver.
         overrides: dotted key of the scene -> value.
-        tables: table of the scene -> key -> value. For [contact] use `overrides`, since `contact`
-            is the contact model.
+        tables: table of the scene -> key -> value.
 
     Raises:
         InputError: the scene, a file, a key or the number of workers cannot be used; a case is
@@ -226,6 +226,8 @@ def simulate(
         KeyboardInterrupt: the run was interrupted. The finished frames are in `directory`.
     """
     options = PoolOptions(workers)
+    if isinstance(contact, Mapping):
+        tables, contact = {**tables, "contact": contact}, None
     changes = _dotted(overrides or {}, tables)
     if isinstance(scene, str | Path):
         scene_path, scene = scene, load_scene(scene, changes)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tkamb.geometry.frames import Array, Mask
 from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
@@ -222,6 +223,18 @@ def _adjustment_flags(case: "Case", body: "FrameLoads") -> list[str]:
     return [f"femoral adjustment changes the total force by {change:.2f} BW: {body.effect.cause}"]
 
 
+def out_of_equilibrium(across: Array | float, normal: Array | float, body_weight: float) -> Mask:
+    """Return whether a recorded patella is not in equilibrium with its lines.
+
+    Args:
+        across: patellofemoral force across the button's normal, N.
+        normal: patellofemoral force along it, N.
+        body_weight: body weight, N.
+    """
+    limit = np.maximum(PATELLA_ACROSS * np.abs(normal), PATELLA_LIGHT * body_weight)
+    return np.asarray(np.abs(across) > limit)
+
+
 def _patella_flags(case: "Case", body: "FrameLoads") -> list[str]:
     """Return a flag if the recorded patella is not in equilibrium with its lines."""
     patella = case.scene.patella
@@ -230,7 +243,7 @@ def _patella_flags(case: "Case", body: "FrameLoads") -> list[str]:
     values = body.loads.values
     across = abs(values.get("patellofemoral_tangential", 0.0))
     normal = abs(values.get("patellofemoral", 0.0))
-    if not across > max(PATELLA_ACROSS * normal, PATELLA_LIGHT * case.body_weight):
+    if not out_of_equilibrium(across, normal, case.body_weight):
         return []
     return [
         f"recorded patella is not in equilibrium with its lines: {across:.0f} N across the "

@@ -32,8 +32,8 @@ from tkamb.run.discrepancy import discrepancy_summary
 from tkamb.run.identity import relative_paths, scene_hash
 from tkamb.run.known_errors import as_json, known_error, left_out
 from tkamb.run.read_scene import STRAIN_FLEXIONS
-from tkamb.run.settings import changed_settings
 from tkamb.run.status import FAILED
+from tkamb.settings import changed_settings
 from tkamb.units import DEGREE, MILLIMETRE
 
 RESIDUALS = (
@@ -178,7 +178,7 @@ def _tolerances(table: ContactTable) -> dict[str, float]:
     from tkamb.contact.lattice.model import CellContact
     from tkamb.contact.registry import contact_model
 
-    model = contact_model(table.model, table.resolution_mm, **table.options)
+    model = contact_model(table.model, resolution=table.resolution_mm * MILLIMETRE, **table.options)
     assert isinstance(model, CellContact)
     settings = model.settings
     return {"force": settings.force_tolerance, "gap": settings.gap_tolerance}

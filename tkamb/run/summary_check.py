@@ -57,6 +57,7 @@ class Uncertainty(TypedDict):
     peak_force_total_BW: NotRequired[Peak | None]
     peaks_BW: NotRequired[dict[str, PeakForce] | None]
     causes_of_failure: NotRequired[Words | None]
+    unbalanced_patella: NotRequired[str]
     shares_of_variance: NotRequired[dict[str, dict[str, Known]] | None]
     measured_inside: NotRequired[dict[str, Inside] | None]
 

@@ -120,7 +120,8 @@ class Profile:
         }
 
     def _of_scene(self, scene: Path, named: Iterable[str]) -> list[Path]:
-        folder, inputs = scene.resolve().parent, {Path(name).resolve() for name in named}
+        folder = scene.resolve().parent
+        inputs = {(folder / name).resolve() for name in named}
         opened = dict.fromkeys(path.resolve() for path in self.opened)
         listed = [path for path in opened if path.is_relative_to(folder) or path in inputs]
         return [path for path in listed if path.is_file()]

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import IO, Any
 
-from tkamb.errors import ComputationError, InputError, TkambError, renamed
+from tkamb.errors import ComputationError, InputError, TkambError
 from tkamb.geometry import threads
 from tkamb.run.guard import log_to_stderr, open_streams, unforeseen_words
 
@@ -373,11 +373,6 @@ def _prepared(task: Task) -> Callable[[int, Any], Any]:
         raise wrong
 
     return refuse
-
-
-def __getattr__(name: str) -> Any:
-    """Return a class by its former name, with a deprecation warning, until release 0.3."""
-    return renamed(__name__, name, {"Crew": PoolOptions, "Team": WorkerPool})
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from tkamb.errors import InputError
+from tkamb.knee.ligament_laws import LIGAMENT_LAWS
 from tkamb.run import texts
 from tkamb.run.claims import compared_forces, method_error
 from tkamb.run.columns import WITHOUT_MUSCLES
@@ -90,17 +91,6 @@ ROTATION_ORDERS = {
     "markers": "skin markers",
 }
 
-LAWS = {
-    "two-line": (
-        "F = (k/2)(L - L0) up to a strain of 0.06 and F = k(L - 1.03 L0) beyond it",
-        "Shin 2007",
-    ),
-    "quadratic-toe": (
-        "F = k eps^2/0.12 up to a strain of 0.06 and F = k(eps - 0.03) beyond it",
-        "Blankevoort and Huiskes 1991",
-    ),
-}
-
 
 @dataclass(frozen=True)
 class Methods:
@@ -150,7 +140,7 @@ def methods(summary: Mapping[str, Any]) -> Methods:
         measures=summary.get("measures") or {},
         contact_words=CONTACT_WORDS,
         rotations=ROTATION_ORDERS,
-        laws=LAWS,
+        laws=_laws(tables),
         generic=_generic_bundles(tables),
         material=_material_words(tables, summary),
         weights=_weights(tables["motion"].get("markers") or {}),
@@ -177,6 +167,13 @@ def _is_cited(key: str, text: str) -> bool:
 def _weights(markers: Mapping[str, Any]) -> str:
     values = {w for one in markers.get("segment", ()) for w in (one.get("weights") or {}).values()}
     return "equal" if values <= {1.0} else "as in the scene file"
+
+
+def _laws(tables: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
+    """Return name -> words and source of the ligaments' laws. Generic bundles are "two-line"."""
+    names = {one["law"] for one in tables.get("ligament") or ()} | {"two-line"}
+    laws = {name: LIGAMENT_LAWS.find(name) for name in LIGAMENT_LAWS.names() if name in names}
+    return {name: (law.words, law.source) for name, law in laws.items()}
 
 
 def _generic_bundles(tables: Mapping[str, Any]) -> dict[str, Any]:

@@ -120,8 +120,8 @@ class Sheet:
         axes.autoscale()
 
 
-def plot(results: "Results", names: tuple[str, ...] = (), axis: str | None = None) -> Figure:
-    """Return the plots of a run in one figure, for notebooks.
+def plot(results: "Results", *names: str, axis: str | None = None) -> Figure:
+    """Return the plots of a run in one matplotlib figure, which notebooks show.
 
     Args:
         results: results of a run.

@@ -119,18 +119,6 @@ def report_html(results: "Results", progress: Progress = lambda drawn: drawn) ->
     )
 
 
-def headline_html(results: "Results") -> str:
-    """Return the headline numbers as HTML with their style, for notebooks."""
-    return render(
-        PACKAGE,
-        "notebook.html",
-        style=asset(PACKAGE, "notebook.css"),
-        title=run_title(results.summary),
-        subtitle=_subtitle(results),
-        cards=cards(results, horizontal_axis(results)),
-    )
-
-
 def _subtitle(results: "Results") -> str:
     summary = results.summary
     contact = summary.get("contact") or {}

@@ -327,7 +327,11 @@ def check_scene(
     begin("reading the scene and its files")
     scene = load_scene(path, overrides)
     if scene.contact:
-        contact_model(scene.contact.model, scene.contact.resolution_mm, **scene.contact.options)
+        contact_model(
+            scene.contact.model,
+            resolution=scene.contact.resolution_mm * MILLIMETRE,
+            **scene.contact.options,
+        )
         given_material(scene.insert_material)
     case = load_case(scene)
     begin("placing leg, patella and muscles")

@@ -144,7 +144,7 @@ def press_closed_form(case: ClosedForm) -> tuple[ContactResult, ContactPair]:
     """
     pair = case.pair
     options = {"cache": case.kind == "kept"} if _has_cache(case.model) else {}
-    model = contact_model(case.model, case.resolution_mm, **options)
+    model = contact_model(case.model, resolution=case.resolution_mm * MILLIMETRE, **options)
     if case.kind != "kept":
         return model.press(model.prepare(pair), case.load_N, np.eye(4)), pair
     with (

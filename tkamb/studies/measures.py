@@ -245,7 +245,7 @@ def _model(job: Job) -> ContactModel:
     options = dict(job.options)
     if "cache" in getattr(contact_class(job.contact), "__dataclass_fields__", {}):
         options.setdefault("cache", False)
-    return contact_model(job.contact, job.resolution_mm, **options)
+    return contact_model(job.contact, resolution=job.resolution_mm * MILLIMETRE, **options)
 
 
 def _first(

@@ -200,7 +200,9 @@ def compute_reference(case: StudyCase, grids_mm: tuple[float, ...] | None = None
     finest: dict[str, float] = {}
     for family in FAMILIES:
         for grid in grids_mm:
-            model = contact_model(family, grid, tolerance=REFERENCE.tolerance, cache=False)
+            model = contact_model(
+                family, resolution=grid * MILLIMETRE, tolerance=REFERENCE.tolerance, cache=False
+            )
             result = model.press(model.prepare(case.pair), case.load, case.pose)
             if result.status is not ContactStatus.OK:
                 why = "; ".join(result.flags)

@@ -47,6 +47,7 @@ from tkamb.studies.closed_forms import (
 )
 from tkamb.studies.extremes import Extreme
 from tkamb.studies.measures import Quantities, errors, quantities
+from tkamb.units import MILLIMETRE
 
 
 @dataclass(frozen=True)
@@ -313,7 +314,7 @@ def _model(extreme: Extreme, **options: Any) -> ContactModel:
     fields = getattr(contact_class(extreme.model), "__dataclass_fields__", {})
     if "cache" in fields:
         options["cache"] = False
-    return contact_model(extreme.model, extreme.resolution_mm, **options)
+    return contact_model(extreme.model, resolution=extreme.resolution_mm * MILLIMETRE, **options)
 
 
 def _reference(extreme: Extreme, state: Any, result: ContactResult) -> ContactResult:

@@ -43,7 +43,7 @@ from tkamb.contact.lattice.solver import Solution, solve, solve_by_newton
 from tkamb.contact.materials import LinearElastic, Material
 from tkamb.contact.model import ContactModel, Probe
 from tkamb.contact.pair import ContactPair
-from tkamb.contact.pressing import check_load, within_insert
+from tkamb.contact.pressing import beside_words, check_load, within_insert
 from tkamb.contact.result import ContactResult, Guess, WarmStart
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array, Index, Mask
@@ -188,7 +188,7 @@ class CellContact(ContactModel):
         """
         pose = np.array(pose, float)
         if not np.isfinite(pose).all():
-            return _with_start(ContactResult.failed(state, pose, "the pose is not finite"))
+            return _with_start(ContactResult.out_of_range(state, pose, "the pose is not finite"))
         gaps, planes = undeformed(state.problem, pose)
         overlap = -float(gaps.min())
         if overlap <= LEAST_OVERLAP:
@@ -206,12 +206,13 @@ class CellContact(ContactModel):
         check_load(load)
         pose = np.array(pose, float)
         if not np.isfinite(pose).all():
-            return _with_start(ContactResult.failed(state, pose, "the pose is not finite"))
+            return _with_start(ContactResult.out_of_range(state, pose, "the pose is not finite"))
         gaps, planes = undeformed(state.problem, pose)
         lowest = float(gaps.min())
         if not np.isfinite(lowest):
-            reason = "the femoral component does not lie over the insert"
-            return _with_start(ContactResult.failed(state, pose, reason))
+            return _with_start(
+                ContactResult.out_of_range(state, pose, beside_words(state.pair, pose))
+            )
         if load == 0:
             pose = state.pair.pose_at_approach(pose, 0.0)
             gaps, _ = undeformed(state.problem, pose)
@@ -276,7 +277,7 @@ class CellContact(ContactModel):
                 start = _start_after(state, at_pose, solution, overlap + approach)
             depth = 1.1 * approach
         saturated = "the set of candidate nodes is saturated"
-        return _with_start(ContactResult.failed(state, pose, saturated))
+        return _with_start(ContactResult.out_of_range(state, pose, saturated))
 
     def _solution(
         self,

@@ -201,7 +201,9 @@ def result_of(
     pose = pose.copy()
     pose[1, 3] -= depth
     if solution.field is not None and not np.isfinite(solution.field).all():
-        return ContactResult.failed(state, pose, "the solver diverged: its forces are not finite")
+        return ContactResult.out_of_range(
+            state, pose, "the solver diverged: its forces are not finite"
+        )
     force, pressure, area = _pressures(state, gaps - depth, solution, rule)
     with_fields = partial(
         ContactResult.of,
@@ -213,7 +215,7 @@ def result_of(
         return with_fields(state, pose, pressure, gaps - depth, force, area, area)
     flags, collapsed = strain_flags(state, solution)
     if collapsed:
-        return ContactResult.failed(state, pose, *flags)
+        return ContactResult.out_of_range(state, pose, *flags)
     if not solution.converged:
         flags = (*flags, unconverged_flag(solution))
     gap = _gaps(state, pose, gaps - depth, force, solution)

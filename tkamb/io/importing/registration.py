@@ -15,8 +15,8 @@ stride and slowly within it. c is therefore the number of frames per independent
 the inverse of the reduced matrix is the covariance of θ.
 
 References: Reinbolt et al., J Biomech 38:621 (2005), doi:10.1016/j.jbiomech.2004.03.031; Andersen
-et al., Multibody Syst Dyn 24:235 (2010), doi:10.1007/s11044-010-9216-8; Werling et al., PLoS ONE
-18:e0295152 (2023), doi:10.1371/journal.pone.0295152.
+et al., Comput Methods Biomech Biomed Eng 13:171 (2010), doi:10.1080/10255840903067080; Werling et
+al., PLoS ONE 18:e0295152 (2023), doi:10.1371/journal.pone.0295152.
 """
 
 from collections.abc import Sequence

@@ -209,6 +209,7 @@ def read_ligaments(scene: Scene, parts: ImplantParts, chain: Chain) -> "tuple[Li
 
 def ligament(table: LigamentTable, left: bool = False) -> "Ligament":
     """Return the bundle that a table describes, mirrored if `left`."""
+    from tkamb.knee.ligament_laws import ligament_law
     from tkamb.knee.ligaments import Ligament
 
     stiffness = table.stiffness_N_per_strain
@@ -219,8 +220,7 @@ def ligament(table: LigamentTable, left: bool = False) -> "Ligament":
         table.name,
         _point(table.proximal, left),
         _point(table.distal, left),
-        table.law,
-        stiffness,
+        ligament_law(table.law, stiffness),
         NAN if table.slack_length_mm is None else table.slack_length_mm * MILLIMETRE,
         NAN if table.reference_strain is None else table.reference_strain,
         table.reference_flexion_deg * DEGREE,

@@ -107,7 +107,7 @@ def _ligament(bundle: "Ligament", s: float) -> "Ligament":
         bundle,
         proximal=_point(bundle.proximal, s),
         distal=_point(bundle.distal, s),
-        stiffness=bundle.stiffness * (s if bundle.law == "two-line" else s**2),
+        law=bundle.law.scaled(s),
         slack_length=bundle.slack_length * s,
     )
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
+from tkamb.errors import InputError
 from tkamb.io import CONTACT_MODEL
 from tkamb.io.activities import Activity
 from tkamb.io.recordings.recording_tables import EmgTable
@@ -28,6 +29,7 @@ from tkamb.io.recordings.scene_table import (
     Turn,
     within,
 )
+from tkamb.units import MILLIMETRE
 
 
 class FemoralImplantTable(SceneTable):
@@ -82,6 +84,13 @@ class Attachment(SceneTable):
     point_mm: Point
 
 
+STIFFNESS_KEYS = {
+    "N/m": ("stiffness_N_per_mm", 1.0 / MILLIMETRE),
+    "N per strain": ("stiffness_N_per_strain", 1.0),
+}
+"""Unit of a ligament law -> key of the scene, and its unit in SI."""
+
+
 class LigamentTable(SceneTable):
     """One bundle: tension only, on a straight line.
 
@@ -92,7 +101,7 @@ class LigamentTable(SceneTable):
     name: str = Field(pattern="^[A-Za-z0-9_]+$")
     proximal: Attachment
     distal: Attachment
-    law: Literal["two-line", "quadratic-toe"]
+    law: str = Field(description="`two-line`, `quadratic-toe` or the law of a plug-in")
     # Upper limits: ten times a whole cruciate ligament (Race & Amis 1994: 347 N/mm).
     stiffness_N_per_mm: Annotated[Number | None, within(0, 5000, "give it in N/mm, not in N/m")] = (
         Field(None, gt=0)
@@ -117,13 +126,15 @@ class LigamentTable(SceneTable):
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
-        stiffness = (
-            self.stiffness_N_per_mm if self.law == "two-line" else self.stiffness_N_per_strain
-        )
-        other = self.stiffness_N_per_strain if self.law == "two-line" else self.stiffness_N_per_mm
-        if stiffness is None or other is not None:
-            unit = "N_per_mm" if self.law == "two-line" else "N_per_strain"
-            raise ValueError(f"law '{self.law}' takes stiffness_{unit}, and only that")
+        from tkamb.knee.ligament_laws import LIGAMENT_LAWS
+
+        try:
+            key, _ = STIFFNESS_KEYS[LIGAMENT_LAWS.find(self.law).unit]
+        except InputError as error:
+            raise ValueError(str(error)) from None
+        given = [name for name, _ in STIFFNESS_KEYS.values() if getattr(self, name) is not None]
+        if given != [key]:
+            raise ValueError(f"law '{self.law}' takes {key}, and only that")
         if (self.slack_length_mm is None) == (self.reference_strain is None):
             raise ValueError("give either slack_length_mm or reference_strain")
         return self

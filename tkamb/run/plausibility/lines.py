@@ -115,11 +115,11 @@ def _is_plausible_end(carrier: str, place: Array) -> bool:
 
 def stiffness_questions(case: Case) -> Iterator[Question]:
     """Ask about a stiffness outside the range of ligaments."""
-    for law, (low, high), scale, unit in (
-        ("two-line", STIFFNESS_PER_MM, MILLIMETRE, "N/mm"),
-        ("quadratic-toe", STIFFNESS_PER_STRAIN, 1.0, "N per unit strain"),
+    for si_unit, (low, high), scale, unit in (
+        ("N/m", STIFFNESS_PER_MM, MILLIMETRE, "N/mm"),
+        ("N per strain", STIFFNESS_PER_STRAIN, 1.0, "N per unit strain"),
     ):
-        values = {b.name: b.stiffness * scale for b in case.ligaments if b.law == law}
+        values = {b.name: b.law.stiffness * scale for b in case.ligaments if b.law.unit == si_unit}
         if odd := [name for name, k in values.items() if not low <= k <= high]:
             yield Question(
                 f"{some(odd)}: {values[odd[0]]:g} {unit} is no ligament's stiffness ({low:g} to "

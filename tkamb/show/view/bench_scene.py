@@ -23,8 +23,10 @@ from tkamb.io.recordings.motion import KneeMotion
 from tkamb.io.recordings.recording_tables import GroundReactionTable, MotionTable, TibiaTable
 from tkamb.io.recordings.scene_table import SceneTable
 from tkamb.io.scene.case import Case
+from tkamb.io.scene.tables import STIFFNESS_KEYS
 from tkamb.io.starter.person import Person, patient_urdf
 from tkamb.knee.knee import Knee
+from tkamb.knee.ligament_laws import law_name
 from tkamb.knee.load import LinkPoint
 from tkamb.knee.parts import mirrored_surface
 from tkamb.units import MILLIMETRE
@@ -188,17 +190,13 @@ def ligament_table(bundle: "Ligament", side: float) -> dict[str, Any]:
         x, y, z = (float(value) / MILLIMETRE for value in point.position)
         return {"link": point.link, "point_mm": [x, y, side * z]}
 
-    stiffness = (
-        {"stiffness_N_per_mm": float(bundle.stiffness) / 1000.0}
-        if bundle.law == "two-line"
-        else {"stiffness_N_per_strain": float(bundle.stiffness)}
-    )
+    key, unit = STIFFNESS_KEYS[bundle.law.unit]
     return {
         "name": bundle.name,
         "proximal": end(bundle.proximal),
         "distal": end(bundle.distal),
-        "law": bundle.law,
-        **stiffness,
+        "law": law_name(bundle.law),
+        key: float(bundle.law.stiffness) / unit,
         "slack_length_mm": float(bundle.slack_length) / MILLIMETRE,
     }
 

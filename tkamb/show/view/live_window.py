@@ -46,6 +46,7 @@ from tkamb.show.view.show import serve_in_background
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
 SCRIPTS = ("scene.js", "moving.js", "controls.js", "live.js")
+DEFAULT_FOLDER = Path("out") / "live"
 COARSE = ("foundation", 2.0)
 """Contact model and spacing (mm) that are used while a slider moves."""
 STRAIN_LIMIT = 0.1
@@ -275,38 +276,65 @@ def open_live(
     from tkamb.show.view.run import read_source
 
     case = read_source(path, contact).case
-    return LiveWindow(LiveKnee(case), folder or Path("out") / "live", frame)
+    return LiveWindow(LiveKnee(case), folder or DEFAULT_FOLDER, frame)
 
 
 def live(
-    path: str | Path, *, frame: int = 0, contact: str | None = None, folder: Path | None = None
+    source: str | Path | Knee,
+    q: Any = None,
+    load: float | None = None,
+    *,
+    frame: int = 0,
+    contact: str | None = None,
+    folder: str | Path | None = None,
 ) -> ViewServer:
-    """Start the server of the live window in a thread, for notebooks.
+    """Start a page on which a user moves and loads a knee by hand (docs/live.md).
+
+    The load acts along the insert's y axis, in addition to the ligaments between femur and tibia.
+    The page does not change a `tkamb.Knee`.
 
     Args:
-        path: a scene file, or a folder that `tkamb run` wrote.
+        source: a scene file, a folder that `tkamb run` wrote, or a `tkamb.Knee`.
+        q: configuration of the `tkamb.Knee`, shape (nq,); or (f, nq) for the slider "recorded
+            frame".
+        load: first value of the load on a `tkamb.Knee`, N; default: 1000 N.
         frame: recorded frame at which the window opens.
         contact: contact model that replaces the scene's.
         folder: folder for saved scenes; None: out/live.
 
     Returns:
-        The server. Its address is `url`, and `close()` stops it.
+        The server, in a thread. Its address is `url`, and `close()` stops it.
 
     Raises:
-        InputError: the path has no scene, or the scene has no [contact].
+        InputError: the path has no scene, the scene or the knee has no contact model, or an
+            argument belongs to the other kind of source.
     """
-    server = open_live(Path(path), frame=frame, contact=contact, folder=folder).server()
+    server = _window_of(source, q, load, frame, contact, Path(folder or DEFAULT_FOLDER)).server()
     serve_in_background(server)
     return server
 
 
-def live_knee(knee: Knee, q: Any, load: float, folder: str | Path | None) -> ViewServer:
-    """Start the server of the live window of a knee in a thread; see `tkamb.Knee.live`."""
-    window = LiveWindow(bench_of_knee(knee, q), Path(folder or Path("out") / "live"))
-    window.start = BenchRequest.read(asdict(window.start) | {"load_N": load})
-    server = window.server()
-    serve_in_background(server)
-    return server
+def _window_of(
+    source: str | Path | Knee,
+    q: Any,
+    load: float | None,
+    frame: int,
+    contact: str | None,
+    folder: Path,
+) -> LiveWindow:
+    if not isinstance(source, Knee):
+        if q is not None or load is not None:
+            raise InputError("q and load belong to a tkamb.Knee", "live", "the scene has its own")
+        return open_live(Path(source), frame=frame, contact=contact, folder=folder)
+    if contact is not None:
+        raise InputError("contact belongs to a scene", "live", "give knee.with_contact(...)")
+    if q is None:
+        raise InputError("q is missing", "live", f"give a configuration ({source.model.nq},)")
+    window = LiveWindow(bench_of_knee(source, q), folder, frame)
+    window.start = BenchRequest.read(
+        asdict(window.start) | {"load_N": 1000.0 if load is None else load}
+    )
+    return window
 
 
 def bench_of_knee(knee: Knee, q: Any) -> LiveKnee:
@@ -323,8 +351,10 @@ def bench_of_knee(knee: Knee, q: Any) -> LiveKnee:
     if knee.contact is None or knee.femoral is None or knee.insert is None:
         raise InputError("has no contact model", "Knee", "give contact= and implant=")
     placement = insert_placement(knee.insert)
-    data = knee.create_data_for_kinematics()
-    poses = np.array([knee.at(one, data).pose for one in np.atleast_2d(np.asarray(q, float))])
+    data = knee._kinematic_data()
+    poses = np.array(
+        [knee._kinematics(data, one).pose for one in np.atleast_2d(np.asarray(q, float))]
+    )
     coordinates = knee_coordinates(placement @ poses)
     session = Path(tempfile.mkdtemp(prefix="tkamb-live-"))
     try:

@@ -162,7 +162,9 @@ class ContactSwitch:
             changes = {"model": model} if same_model else {"model": model, "options": {}}
             table = case.scene.contact.model_copy(update=changes)
             case = replace(case, scene=case.scene.model_copy(update={"contact": table}))
-            other = contact_model(table.model, table.resolution_mm, **table.options)
+            other = contact_model(
+                table.model, resolution=table.resolution_mm * MILLIMETRE, **table.options
+            )
             mechanics = self.run.mechanics.with_contact(other)
             self._sides[model] = contact_side(case, mechanics)
         return self._sides[model]

@@ -7,7 +7,7 @@ frames, runs.csv, groups.csv, cohort.json and the report are written together.
 import json
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -24,12 +24,11 @@ from tkamb.run.columns import ordered_names
 from tkamb.run.guard import interrupt_as_such
 from tkamb.run.identity import CONTACT_CODE, contact_code
 from tkamb.run.recorder import Shards
-from tkamb.run.results import page
 from tkamb.run.results_folder import remove_shards
 from tkamb.run.workers import PoolOptions, Progress, Task
 from tkamb.studies.cohort.outcome import CohortWorker, Outcome
 from tkamb.studies.cohort.plan import GROUP_AXES, Cohort, CohortRun, load_cohort
-from tkamb.studies.cohort.statistics import group_rows, groups_of
+from tkamb.studies.cohort.statistics import Group, group_rows, groups_of
 
 try:
     import pyarrow as pa
@@ -40,12 +39,18 @@ except ImportError:
 TABLE_NAME, RUNS_NAME, GROUPS_NAME = "cohort.parquet", "runs.csv", "groups.csv"
 SUMMARY_NAME, REPORT_NAME = "cohort.json", "cohort.html"
 LABELS = ("subject", *GROUP_AXES)
+Report = Callable[[Cohort, Mapping[int, Outcome], list[Group]], str]
+"""Makes the page cohort.html."""
 
 
 def write_cohort(
-    cohort: Cohort, outcomes: Mapping[int, Outcome], identity: Mapping[str, Any], folder: Path
+    cohort: Cohort,
+    outcomes: Mapping[int, Outcome],
+    identity: Mapping[str, Any],
+    folder: Path,
+    report: Report | None = None,
 ) -> None:
-    """Write cohort.parquet, runs.csv, groups.csv, cohort.json and cohort.html, all or none.
+    """Write cohort.parquet, runs.csv, groups.csv, cohort.json and a cohort.html, all or none.
 
     Raises:
         InputError: the folder cannot be written.
@@ -58,8 +63,12 @@ def write_cohort(
             pq.write_table(table, file, compression="zstd")
         write_rows(files.path(RUNS_NAME), runs)
         write_rows(files.path(GROUPS_NAME), group_rows(groups, cohort.group_by))
-        write_synced(files.path(REPORT_NAME), page("cohort")(cohort, outcomes, groups))
-        names = (TABLE_NAME, RUNS_NAME, GROUPS_NAME, REPORT_NAME)
+        names = [TABLE_NAME, RUNS_NAME, GROUPS_NAME]
+        if report is None:
+            files.remove(REPORT_NAME)
+        else:
+            write_synced(files.path(REPORT_NAME), report(cohort, outcomes, groups))
+            names.append(REPORT_NAME)
         summary = {
             "title": cohort.table.title,
             "cohort": str(cohort.path.absolute()),
@@ -200,6 +209,7 @@ def run_cohort(
     resume: bool = False,
     force: bool = False,
     progress: Progress = lambda runs, count: runs,
+    report: Report | None = None,
 ) -> dict[int, Outcome]:
     """Compute the runs of a cohort and write its table and report.
 
@@ -215,6 +225,7 @@ def run_cohort(
         resume: use the runs that are stored in the folder, also those of parts.
         force: write into the folder even if it contains files of other programs.
         progress: wrapper of the iterator of the finished runs.
+        report: function that returns the page cohort.html; None: the folder has no report.
 
     Returns:
         Number of the run -> its outcome, for all runs of the cohort or of the part.
@@ -249,7 +260,7 @@ def run_cohort(
             raise KeyboardInterrupt(words) from None
         outcomes = {number: outcomes[number] for number in numbers}
         if part is None:
-            write_cohort(cohort, outcomes, identity, folder)
+            write_cohort(cohort, outcomes, identity, folder, report)
             for shard_folder in (folder, *parts):
                 remove_shards(shard_folder)
     return outcomes

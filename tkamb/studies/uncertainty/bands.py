@@ -19,10 +19,13 @@ from tkamb.run.discrepancy import (
     load_of,
 )
 from tkamb.run.results import PERCENTILES, STATISTICS_LIMITS
+from tkamb.run.status import out_of_equilibrium
 
 ENDS = ("p05", "p95")
 TOTALS_N = ("force_si_N", "force_total_N")
 """Columns of results.csv with the total force. The first one present is used."""
+PATELLOFEMORAL = ("patellofemoral_tangential_N", "patellofemoral_N")
+"""Columns of results.csv with the force across the button's normal, and along it."""
 ROUND_OFF = 1e-9
 """Ratio of standard deviation to magnitude below which a result counts as constant."""
 SAMPLES_PER_INPUT = 6
@@ -135,6 +138,34 @@ def band_columns(
         for ending, limits in percentiles(values[:, index], failed).items():
             columns[f"{name}_{ending}"] = limits
     return columns
+
+
+def unbalanced_patella(
+    names: Sequence[str], values: Array, body_weight: float
+) -> tuple[dict[str, Array], str]:
+    """Return how often a recorded patella is not in equilibrium with its lines, by `status`.
+
+    Args:
+        names: names of m columns of results.csv.
+        values: values of the samples, shape (n, m, f).
+        body_weight: body weight, N.
+
+    Returns:
+        The column `patella_unbalanced_share` of bands.csv: the share of the samples with a force;
+        and a sentence, "" if it is 0 in all frames.
+    """
+    across, normal = (np.abs(values[:, list(names).index(name)]) for name in PATELLOFEMORAL)
+    unbalanced = out_of_equilibrium(across, normal, body_weight)
+    share = unbalanced.sum(axis=0) / np.maximum(np.isfinite(normal).sum(axis=0), 1)
+    words = ""
+    if unbalanced.any():
+        worst = (across[unbalanced] / normal[unbalanced]).max()
+        words = (
+            f"in up to {share.max():.0%} of the samples of a frame the recorded patella is not in "
+            f"equilibrium with its lines: up to {worst:.0%} of the patellofemoral force acts "
+            "across the button"
+        )
+    return {"patella_unbalanced_share": share}, words
 
 
 def discrepancy_columns(

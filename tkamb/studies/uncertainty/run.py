@@ -4,7 +4,7 @@ Workers compute the samples. Each finished sample is stored immediately, so that
 analysis can be resumed. The samples give bands, tornado table and optional Sobol' indices.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -42,6 +42,7 @@ from tkamb.studies.uncertainty.bands import (
     influences,
     measured_inside,
     peak_band,
+    unbalanced_patella,
 )
 from tkamb.studies.uncertainty.inputs import VariedInput, held_inputs, uncertainty_of, varied_inputs
 from tkamb.studies.uncertainty.sample import BandWorker, Sample
@@ -54,7 +55,9 @@ from tkamb.studies.uncertainty.sampling import (
 from tkamb.studies.uncertainty.sensitivity import SobolIndex, sobol_indices
 
 
-def write_uncertainty(uncertainty: "Uncertainty", folder: Path) -> None:
+def write_uncertainty(
+    uncertainty: "Uncertainty", folder: Path, report: Callable[[Results], str] | None = None
+) -> None:
     """Write nominal results, bands, tornado table, samples and indices together.
 
     Raises:
@@ -83,7 +86,7 @@ def write_uncertainty(uncertainty: "Uncertainty", folder: Path) -> None:
     }
     if uncertainty.indices:
         more[INDICES_NAME] = lambda path: write_rows(path, _index_rows(uncertainty.indices))
-    write_results(uncertainty.results, folder, more=more)
+    write_results(uncertainty.results, folder, more=more, report=report)
 
 
 def _band_rows(columns: Mapping[str, Any]) -> list[Sequence[str]]:
@@ -175,6 +178,7 @@ def estimate_uncertainty(
     resume: bool = False,
     force: bool = False,
     progress: Progress = lambda samples, count: samples,
+    report: Callable[[Results], str] | None = None,
 ) -> Uncertainty:
     """Vary the inputs of a scene as described in its table [uncertainty] and return bands.
 
@@ -196,6 +200,7 @@ def estimate_uncertainty(
         resume: whether to use the samples that an interrupted run stored in the folder.
         force: whether to write into a folder that contains files of other programs.
         progress: wrapper of the iterator of the finished samples.
+        report: function that returns the page report.html; None: the folder has no report.
 
     Raises:
         InputError: the input is invalid, or the folder holds another run or is in use.
@@ -234,7 +239,7 @@ def estimate_uncertainty(
             return job.run(None)
         identity = nominal.summary["identity"] | {"method of sampling": job.design}
         uncertainty = job.run(Shards(folder, identity, resume))
-        write_uncertainty(uncertainty, folder)
+        write_uncertainty(uncertainty, folder, report)
     return uncertainty
 
 
@@ -317,6 +322,11 @@ class _Job:
         summary, weight = self.nominal.summary, self.case.body_weight
         bands |= discrepancy_columns(names, values, summary, weight)
         summary["uncertainty"] = self._summary(problems, tornado)
+        patella = self.case.scene.patella
+        if patella is not None and patella.motion == "recorded":
+            columns, words = unbalanced_patella(names, values, weight)
+            bands |= columns
+            summary["uncertainty"]["unbalanced_patella"] = words
         if PEAK in names:
             peak = peak_band(self.nominal[PEAK], values[:, names.index(PEAK)], failed)
             summary["uncertainty"]["peak_force_total_BW"] = peak

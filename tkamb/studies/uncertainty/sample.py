@@ -147,7 +147,7 @@ def _ligament(case: Case, bundle: Ligament, draw: Draw) -> Ligament:
         bundle,
         proximal=_on_femur(case, bundle.proximal, draw),
         distal=_on_femur(case, bundle.distal, draw),
-        stiffness=bundle.stiffness * draw.factor(f"ligament_stiffness.{bundle.name}"),
+        law=bundle.law.stiffened(draw.factor(f"ligament_stiffness.{bundle.name}")),
         # either the slack length or the reference strain is NaN and remains NaN
         slack_length=bundle.slack_length / (1.0 + strain),
         reference_strain=bundle.reference_strain + strain,

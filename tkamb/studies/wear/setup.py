@@ -347,7 +347,7 @@ def _engine(case: Case, table: ContactTable) -> ContactEngine:
     options = dict(table.options)
     if "cache" in contact_options(table.model):
         options["cache"] = False  # each update of the geometry needs another operator
-    model = contact_model(table.model, table.resolution_mm, **options)
+    model = contact_model(table.model, resolution=table.resolution_mm * MILLIMETRE, **options)
     return ContactEngine(
         model, case.femoral, given_material(case.scene.insert_material), insert.bearing
     )

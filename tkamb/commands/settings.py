@@ -1,25 +1,22 @@
 """The settings of tkamb's algorithms (`tkamb settings`).
 
-A settings object is an instance of a frozen dataclass with a name that ends in `Settings`. It is
-defined at the top level of the module that uses it. Each field has a docstring with unit, meaning
-and origin. This module finds the settings objects in the package.
+`tkamb.settings` describes a settings object. This module finds those of the package.
 """
 
 import argparse
 import ast
 import json
-import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from dataclasses import asdict, dataclass, fields
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from tkamb.errors import InputError
+from tkamb.settings import SUFFIX
 
 PACKAGE = Path(__file__).parents[1]
-SUFFIX = "Settings"
 
 
 @dataclass(frozen=True)
@@ -55,31 +52,6 @@ def all_settings() -> list[Setting]:
         for name in names:
             rows += _rows(module, name, text)
     return rows
-
-
-def changed_settings() -> dict[str, Any]:
-    """Return name -> value of the settings that differ from their defaults in this process.
-
-    Only imported modules count, since no other module has computed anything.
-    """
-    changed: dict[str, Any] = {}
-    for module_name, module in sorted(sys.modules.items()):
-        if not module_name.startswith("tkamb.") or module is None:
-            continue
-        for name, value in vars(module).items():
-            if _is_settings(value) and type(value).__module__ == module_name:
-                default = type(value)()
-                changed |= {
-                    f"{name.lower()}.{field.name}": getattr(value, field.name)
-                    for field in fields(value)
-                    if getattr(value, field.name) != getattr(default, field.name)
-                }
-    return changed
-
-
-def _is_settings(value: Any) -> bool:
-    kind = type(value)
-    return is_dataclass(value) and kind.__name__.endswith(SUFFIX)
 
 
 def _instances(tree: ast.Module) -> Iterator[tuple[str, str]]:
