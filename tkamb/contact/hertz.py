@@ -14,6 +14,7 @@ from tkamb.contact.model import ContactModel
 from tkamb.contact.result import CondyleContact, ContactResult, Guess, peak_flags, thickness_under
 from tkamb.contact.samples import MAP_POINT, SampledContact, SurfaceSamples, gaps_along_normals
 from tkamb.geometry.frames import SIDES, Array, Index
+from tkamb.units import MILLIMETRE
 
 
 @dataclass(frozen=True)
@@ -200,9 +201,10 @@ class Hertz(ContactModel):
                 )
             described = patches[side] = _described(samples, geometry.contact, patch)
             if depth >= described.thickness:
-                return ContactResult.out_of_range(
-                    state, pose, f"the {SIDES[side]} condyle is deeper than the insert is thick"
-                )
+                words = f"the {SIDES[side]} condyle is deeper than the insert is thick"
+                most = described.thickness / MILLIMETRE
+                measured = f"{words}: {depth / MILLIMETRE:.2f} mm deep, at most {most:.2f} mm"
+                return ContactResult.out_of_range(state, pose, measured)
             if patch.long_axis > described.thickness:
                 flags.append(
                     f"the long semi-axis of the {SIDES[side]} contact ellipse exceeds the "
