@@ -96,7 +96,7 @@ class ElasticFoundation(ContactModel):
     the map holds a ball on a plate, which nothing else holds, with up to 0.1 % of the load at 1 mm
     and 0.3 % at 2 mm. A column that meets the femur at less than 6 deg is unloaded. There, and
     where an outline of the femoral component passes a column of the rim, the energy jumps
-    (`scripts/measure_energy`). If the penetration is at least half of the thickness, along y or
+    (`scripts/measure/energy`). If the penetration is at least half of the thickness, along y or
     along the normal, the result is OUT_OF_RANGE. Walls parallel to y carry no load. A mobile
     bearing is pressed like a fixed one. The approach counts from the first touch of the triangles;
     the smooth surface lies outside them by up to their sagitta.
