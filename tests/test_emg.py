@@ -13,7 +13,7 @@ from shared_trials import STRENGTHS, two_flexors
 from tkamb.errors import InputError
 from tkamb.io.recordings.measured import Envelopes, envelope, load_envelopes
 from tkamb.io.recordings.recording_tables import EmgTable
-from tkamb.run.muscles.sharing import SHARING, EmgGuide
+from tkamb.run.muscles.sharing import KKT_TOLERANCE, EmgGuide
 from tkamb.run.recorded import compare_emg, fitted_normalisation
 
 RATE = 1200.0
@@ -163,7 +163,7 @@ def test_a_target_has_the_optimum_of_the_closed_form():
     multiplier = (MOMENT - d @ (pull / stiff)) / (d @ (d / stiff))
     np.testing.assert_allclose(activation[1:], (pull + multiplier * d) / stiff, rtol=1e-9)
     assert status == "ok"
-    assert residual < SHARING.kkt_tolerance
+    assert residual < KKT_TOLERANCE
 
 
 def test_bounds_limit_the_activation_to_the_width_about_the_envelope():
@@ -172,7 +172,7 @@ def test_bounds_limit_the_activation_to_the_width_about_the_envelope():
     assert activation[1] == pytest.approx(0.45)  # without EMG it is 0.61
     assert activation[2] == pytest.approx((MOMENT - 0.45 * 0.05 * 1800) / (0.04 * 1200))
     assert status == "ok"
-    assert residual < SHARING.kkt_tolerance
+    assert residual < KKT_TOLERANCE
 
 
 def test_bounds_of_the_envelope_are_within_those_of_all_muscles():

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from shapes import joined, plate, two_dishes
 from tkamb.errors import InputError
-from tkamb.geometry.flat_bottom import FLAT_BOTTOM, find_flat_bottom, find_flats, insert_placement
+from tkamb.geometry.flat_bottom import FLATNESS, find_flat_bottom, find_flats, insert_placement
 from tkamb.geometry.frames import pose, transform
 from tkamb.geometry.surface import Surface
 from tkamb.io.recordings.meshes import axes_rotation, load_surface
@@ -122,7 +122,7 @@ def test_the_frame_of_a_real_insert_does_not_depend_on_tilt_and_noise(subject):
     placement = insert_placement(insert)
     assert np.array_equal(placement[:3, :3], np.eye(3))
     placed = insert.moved(placement)
-    assert abs(placed.bounds[0, 1]) < FLAT_BOTTOM.flatness
+    assert abs(placed.bounds[0, 1]) < FLATNESS
     flat = find_flat_bottom(insert)
     assert 2.0e-3 < flat.area < 2.4e-3
     for x_deg, z_deg in [(10, 0), (-10, 0), (0, 10), (0, -10)]:

@@ -13,7 +13,7 @@ from tkamb.contact.pair import ContactPair
 from tkamb.contact.registry import contact_model
 from tkamb.geometry.surface import Surface
 from tkamb.run.known_errors import (
-    KNOWN_ERROR,
+    LEAST_PAIRS,
     ContactSituation,
     is_large,
     known_error,
@@ -45,7 +45,7 @@ def stated(contact):
 
 def test_an_error_is_stated_within_the_range_of_its_pairs():
     error = stated(USUAL)
-    assert error.pairs >= KNOWN_ERROR.least_pairs
+    assert error.pairs >= LEAST_PAIRS
     # The facets' sag is added to the error of the approach only.
     coarse = stated(replace(USUAL, sag=0.1))
     assert coarse.approach == pytest.approx(error.approach + 0.1)

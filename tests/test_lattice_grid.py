@@ -36,7 +36,7 @@ from tkamb.contact.lattice.meshing.grid import (
     grid_spacing,
 )
 from tkamb.contact.lattice.meshing.quality import measure_quality
-from tkamb.contact.lattice.meshing.walls import NOTCH
+from tkamb.contact.lattice.meshing.walls import CORNER_MARGIN
 from tkamb.errors import InputError
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import pose
@@ -186,7 +186,7 @@ def test_contact_nodes_lie_on_the_surface(name):
     distance = distances(surface, lattice.nodes[lattice.contact_nodes], reach=5e-4)
     in_a_notch = notch_nodes(lattice)
     assert distance[~in_a_notch].max() < 1e-9
-    assert distance.max() < NOTCH.corner_margin * np.linalg.norm(lattice.spacing[[0, 2]])
+    assert distance.max() < CORNER_MARGIN * np.linalg.norm(lattice.spacing[[0, 2]])
     assert np.abs(lattice.nodes[lattice.bottom_nodes, 1]).max() < 5e-5
     assert scaled_jacobians(lattice.nodes[lattice.cells]).min() > 0.0
     columns = lattice.index[lattice.contact_nodes][:, [0, 2]]
@@ -436,7 +436,7 @@ def test_classes_are_right_with_noise_of_ten_micrometres(name):
     kind, nodes = lattice.node_class, lattice.nodes
     distance = distances(surface, nodes[kind == CONTACT], 5e-4)
     diagonal = np.linalg.norm(lattice.spacing[[0, 2]])
-    on_top = distance < np.where(notch_nodes(lattice), NOTCH.corner_margin * diagonal, 3e-5)
+    on_top = distance < np.where(notch_nodes(lattice), CORNER_MARGIN * diagonal, 3e-5)
     on_bottom = np.abs(nodes[kind == BOTTOM, 1]) < 5e-5
     inside = surface.winding.inside(nodes[kind == INTERNAL])
     near_wall = distances(surface, nodes[kind == OTHER], 2.5e-3) < 2.5e-3

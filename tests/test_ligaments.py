@@ -16,7 +16,7 @@ from tkamb.io.scene.case import load_case
 from tkamb.io.scene.parts import ligament
 from tkamb.io.scene.tables import LigamentTable
 from tkamb.knee.ligament_laws import (
-    LIGAMENT_LAW,
+    TOE_STRAIN,
     LigamentLaw,
     QuadraticToe,
     StackedLaws,
@@ -64,8 +64,8 @@ def test_laws(law: type, stiffness: float, terminal: float) -> None:
         [
             -0.5,
             0.0,
-            2 * LIGAMENT_LAW.toe_strain * (1 - 1e-12),
-            2 * LIGAMENT_LAW.toe_strain * (1 + 1e-12),
+            2 * TOE_STRAIN * (1 - 1e-12),
+            2 * TOE_STRAIN * (1 + 1e-12),
             0.1,
         ]
     )
@@ -74,8 +74,8 @@ def test_laws(law: type, stiffness: float, terminal: float) -> None:
     assert force[0] == 0.0
     assert force[1] == 0.0
     assert force[2] == pytest.approx(force[3], rel=1e-9)
-    assert force[2] == pytest.approx(terminal * LIGAMENT_LAW.toe_strain)
-    assert (force[4] - force[3]) / (0.1 - 2 * LIGAMENT_LAW.toe_strain) == pytest.approx(terminal)
+    assert force[2] == pytest.approx(terminal * TOE_STRAIN)
+    assert (force[4] - force[3]) / (0.1 - 2 * TOE_STRAIN) == pytest.approx(terminal)
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ def test_laws_are_found_by_name_and_impossible_numbers_are_refused() -> None:
 
 
 def test_quadratic_toe_has_no_kink() -> None:
-    e, h = 2 * LIGAMENT_LAW.toe_strain, 1e-7
+    e, h = 2 * TOE_STRAIN, 1e-7
     f = QuadraticToe(1.0).tension(SLACK * (1 + np.array([e - h, e, e + h])), SLACK)
     assert (f[1] - f[0]) / h == pytest.approx((f[2] - f[1]) / h, rel=1e-4)
 

@@ -18,7 +18,7 @@ from tkamb.show.levels import PageGrid, pressure_levels
 from tkamb.show.pages import asset
 from tkamb.show.panels import panels
 from tkamb.show.plots import Sheet
-from tkamb.show.pressure_maps import PRESSURE_PICTURE, TopView, draw_pressure
+from tkamb.show.pressure_maps import STEP_MM, TopView, draw_pressure
 from tkamb.show.sections import conclusions
 from tkamb.show.style import new_figure
 
@@ -203,8 +203,6 @@ def test_the_opacity_of_a_round_contact_sums_to_its_area():
         axes = new_figure(3.0, 3.0).add_subplot()
         draw_pressure(axes, view, np.maximum(-gap, 0.0), Normalize(0.0, radius**2), 1e-3 * gap)
         opacity = np.asarray(axes.images[0].get_array())[..., 3] / 255
-        assert opacity.sum() * PRESSURE_PICTURE.step_mm**2 == pytest.approx(
-            np.pi * radius**2, rel=0.02
-        )
+        assert opacity.sum() * STEP_MM**2 == pytest.approx(np.pi * radius**2, rel=0.02)
         partly = (opacity > 0) & (opacity < 1)
-        assert partly.sum() * PRESSURE_PICTURE.step_mm > 2 * np.pi * radius
+        assert partly.sum() * STEP_MM > 2 * np.pi * radius

@@ -13,7 +13,7 @@ from tkamb.contact.lattice import model, report, solver
 from tkamb.contact.lattice.active_set import _forces_of, solve_contact
 from tkamb.contact.lattice.linear import cache
 from tkamb.contact.materials import RambergOsgood
-from tkamb.studies.closed_forms import CLOSED_FORM, ClosedForm, closed_forms, press_closed_form
+from tkamb.studies.closed_forms import KEPT_GRID_MM, ClosedForm, closed_forms, press_closed_form
 from tkamb.studies.extremes import Extreme
 from tkamb.studies.stability import judge_safely, stored_verdicts
 from tkamb.studies.verdict import PEER_BOUNDS, complaints, peer_distances
@@ -66,7 +66,7 @@ def test_a_stress_strain_curve_that_is_5_per_cent_too_high_fails(name, monkeypat
 
 def test_an_operator_key_without_young_s_modulus_fails(monkeypatch):
     """Operators are checked when they are read, so only the number of files shows the fault."""
-    case = ClosedForm("kept", "lattice-linear", resolution_mm=CLOSED_FORM.kept_grid_mm)
+    case = ClosedForm("kept", "lattice-linear", resolution_mm=KEPT_GRID_MM)
     original = cache.operator_key
 
     class SameModulus:

@@ -38,7 +38,7 @@ from tkamb.studies.references import (
     sphere_on_layer,
     write_references,
 )
-from tkamb.studies.tradeoff import TIMING, on_front
+from tkamb.studies.tradeoff import EQUAL_RATIO, on_front
 from tradeoff_blocks import moved
 
 ROOT = Path(__file__).parents[1]
@@ -161,7 +161,7 @@ def test_noise_in_time_does_not_change_the_front():
     assert front[points.index(best)]
     for point, mark in zip(points, front, strict=True):
         if mark:
-            assert not any(t * TIMING.equal_ratio < point[0] and e <= point[1] for t, e in points)
+            assert not any(t * EQUAL_RATIO < point[0] and e <= point[1] for t, e in points)
     again = on_front(
         [(t * f, e) for (t, e), f in zip(points, rng.uniform(1, 1.05, 40), strict=True)]
     )

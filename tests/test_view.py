@@ -23,7 +23,7 @@ from tkamb.run.results_folder import read_results
 from tkamb.show.view import CAMERAS
 from tkamb.show.view.drawing import SLACK, TENDON, PressureMap, rgb
 from tkamb.show.view.lines import _tendon, ligament_strands
-from tkamb.show.view.payload import VIEW_PAYLOAD, Block, _insert_transform, map_levels, shade
+from tkamb.show.view.payload import PRESSURE_LEVELS, Block, _insert_transform, map_levels, shade
 from tkamb.show.view.run import open_run
 from tkamb.show.view.show import Show, serve_in_background
 from viewed import copied_scene, shipped_run, short_results
@@ -118,8 +118,8 @@ def test_levels_are_proportional_to_pressure_and_negative_outside_the_contact():
     gap = np.array([[0.0, 0, 3e-5, 1e-4, 1e-5, 2e-5]])
     level = map_levels(PressureMap(points, triangles, pressure, gap), 4.0)[0]
     assert list(level[:2]) == [
-        VIEW_PAYLOAD.pressure_levels,
-        round(VIEW_PAYLOAD.pressure_levels / 2),
+        PRESSURE_LEVELS,
+        round(PRESSURE_LEVELS / 2),
     ]
     assert (level[2:] < 0).all()
     assert level[2] < level[5] < level[4]

@@ -10,7 +10,7 @@ from tkamb.geometry.frames import transform
 from tkamb.knee.load import PointForces
 from tkamb.run.muscles.shared_muscles import SharedMuscles
 from tkamb.show.view.drawing import SLACK, activation_scale, pressure_scale, rgb, strain_scale
-from tkamb.show.view.lines import VIEW_STRAND, muscle_strands
+from tkamb.show.view.lines import LEAST_ACTIVATION, SLACK_FORCE, muscle_strands
 
 
 def frames():
@@ -43,8 +43,8 @@ def test_colours_follow_the_activation_and_slack_muscles_are_grey():
     geometries = frames()
     strands, limit = muscle_strands(geometries)
     share = geometries[0].share
-    assert share.force[1:].min() > VIEW_STRAND.slack_force
-    assert limit == max(share.activation[1:].max(), VIEW_STRAND.least_activation)
+    assert share.force[1:].min() > SLACK_FORCE
+    assert limit == max(share.activation[1:].max(), LEAST_ACTIVATION)
     for strand, activation in zip(strands, share.activation[1:], strict=True):
         wanted = activation_scale()[int(activation / limit * 255)]
         np.testing.assert_array_equal(strand.colours[0], [wanted, wanted])

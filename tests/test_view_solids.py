@@ -12,13 +12,13 @@ from tkamb.geometry.frames import inverse, transform
 from tkamb.geometry.surface import Surface
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
-from tkamb.run.metrics import METRICS
+from tkamb.run.metrics import JUMP
 from tkamb.run.read_scene import recording_of
 from tkamb.show.style import PRESSURE_MAP
 from tkamb.show.view import drawing as colours
 from tkamb.show.view.draw import draw
 from tkamb.show.view.lines import path_strands
-from tkamb.show.view.payload import SHADING, decimate, shade
+from tkamb.show.view.payload import MAX_TRIANGLES, decimate, shade
 from tkamb.show.view.run import open_run
 from tkamb.show.view.solids import box, floor_and_foot, hull, revolved, solids, sphere_points
 from viewed import MODELS, shipped_run
@@ -89,7 +89,7 @@ def test_a_small_surface_is_not_decimated():
 def test_the_shipped_implant_is_drawn_within_a_third_of_a_millimetre(drawing):
     for solid in drawing.solids:
         drawn = shade(solid.surface)
-        assert len(drawn.faces) <= SHADING.max_triangles
+        assert len(drawn.faces) <= MAX_TRIANGLES
         assert drawn.error < 0.35e-3
 
 
@@ -134,16 +134,14 @@ def test_centres_of_pressure_lie_on_the_insert(run, drawing):
 
 
 def test_a_load_path_is_interrupted_at_a_jump():
-    x = np.array(
-        [0.0, 1e-3, 2e-3, 2e-3 + 1.5 * METRICS.jump, 3e-3 + 1.5 * METRICS.jump, np.nan, 0.0]
-    )
+    x = np.array([0.0, 1e-3, 2e-3, 2e-3 + 1.5 * JUMP, 3e-3 + 1.5 * JUMP, np.nan, 0.0])
     points = np.column_stack([x, np.zeros(7), np.zeros(7)])
     strands = path_strands({"medial": points})
     assert [strand.points.shape[1] for strand in strands] == [3, 2]
 
 
 def test_a_load_path_of_few_frames_is_not_interrupted():
-    x = np.array([0.0, 0.9, 2.1, 3.2]) * 2 * METRICS.jump
+    x = np.array([0.0, 0.9, 2.1, 3.2]) * 2 * JUMP
     points = np.column_stack([x, np.zeros(4), np.zeros(4)])
     assert [strand.points.shape[1] for strand in path_strands({"lateral": points})] == [4]
 

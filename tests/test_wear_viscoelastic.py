@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import brentq
 
 import shapes
-from tkamb.contact.foundation import FOUNDATION
+from tkamb.contact.foundation import LEAST_THICKNESS
 from tkamb.contact.lattice.model import LinearLattice
 from tkamb.contact.materials import Material
 from tkamb.contact.pair import ContactPair
@@ -57,7 +57,7 @@ class ViscoelasticBed:
         moved = np.array(pose, float)
         moved[1, 3] -= descent
         gap = gaps_along_normals(self._bed, self._femoral, moved)
-        imposed = -gap / np.maximum(self._bed.thickness, FOUNDATION.least_thickness)
+        imposed = -gap / np.maximum(self._bed.thickness, LEAST_THICKNESS)
         slope, decay, remaining = self._series.response(step)
         history = decay @ self._memory - remaining.sum() * self._strain
         free = -history / slope  # strain at which the stress is zero

@@ -2,18 +2,9 @@
 
 import difflib
 from collections.abc import Iterable
-from dataclasses import dataclass
 
-
-@dataclass(frozen=True)
-class MessageSettings:
-    """Limit on the length of messages."""
-
-    max_names: int = 8
-    """Largest number of names in a message. Chosen because a message should be short."""
-
-
-MESSAGE = MessageSettings()
+# Largest number of names in a message. Chosen because a message should be short.
+MAX_NAMES = 8
 
 
 class TkambError(Exception):
@@ -58,7 +49,7 @@ def names_near(name: str, names: Iterable[str], title: str = "there are") -> str
     all_names = list(names)
     lower = {each.lower(): each for each in all_names}
     close = difflib.get_close_matches(name.lower(), lower, n=4, cutoff=0.6)
-    more = ", …" if len(all_names) > MESSAGE.max_names else ""
-    listed = f"{title}: {', '.join(all_names[: MESSAGE.max_names]) or 'none'}{more}"
+    more = ", …" if len(all_names) > MAX_NAMES else ""
+    listed = f"{title}: {', '.join(all_names[:MAX_NAMES]) or 'none'}{more}"
     guess = f"did you mean {', '.join(lower[each] for each in close)}? " if close else ""
     return guess + listed

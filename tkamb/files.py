@@ -22,7 +22,6 @@ import tempfile
 import time as clock
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, TreeBuilder
@@ -33,23 +32,16 @@ from tkamb.errors import InputError
 MEGABYTE = 1_000_000
 
 
-@dataclass(frozen=True)
-class FileLimitSettings:
-    """Largest sizes of the files that are read."""
+# bytes: largest scene, URDF or summary. Chosen because the shipped files are a thousand times
+# smaller.
+TEXT_BYTES = 16 * MEGABYTE
+# bytes: largest recording. Chosen because an hour of fifty channels at 200 Hz has 500 MB.
+TABLE_BYTES = 512 * MEGABYTE
+# bytes: largest mesh. Chosen because twenty million triangles in a binary STL have this size.
+MESH_BYTES = 1000 * MEGABYTE
+# Largest depth of nested elements in an XML file. A URDF has 5, an OpenSim model 20.
+XML_DEPTH = 100
 
-    text_bytes: float = 16 * MEGABYTE
-    """bytes: largest scene, URDF or summary. Chosen because the shipped files are a thousand times
-    smaller."""
-    table_bytes: float = 512 * MEGABYTE
-    """bytes: largest recording. Chosen because an hour of fifty channels at 200 Hz has 500 MB."""
-    mesh_bytes: float = 1000 * MEGABYTE
-    """bytes: largest mesh. Chosen because twenty million triangles in a binary STL have this
-    size."""
-    xml_depth: int = 100
-    """Largest depth of nested elements in an XML file. A URDF has 5, an OpenSim model 20."""
-
-
-FILE_LIMITS = FileLimitSettings()
 
 BYTE_ORDER_MARKS = {
     codecs.BOM_UTF8: "utf-8-sig",
@@ -106,9 +98,7 @@ def check_readable(status: os.stat_result, path: str | Path, limit: float) -> No
         raise InputError(f"is {size:.0f} MB large, more than the {most:.0f} MB that are read", path)
 
 
-def read_bytes(
-    path: str | Path, limit: float = FILE_LIMITS.text_bytes, *, what: str = "file"
-) -> bytes:
+def read_bytes(path: str | Path, limit: float = TEXT_BYTES, *, what: str = "file") -> bytes:
     """Return the content of a regular file.
 
     Raises:
@@ -123,7 +113,7 @@ def read_bytes(
 
 def read_text(
     path: str | Path,
-    limit: float = FILE_LIMITS.text_bytes,
+    limit: float = TEXT_BYTES,
     encoding: str = "utf-8",
     *,
     what: str = "file",
@@ -145,9 +135,7 @@ def read_text(
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def read_json(
-    path: str | Path, limit: float = FILE_LIMITS.text_bytes, *, what: str = "file"
-) -> Any:
+def read_json(path: str | Path, limit: float = TEXT_BYTES, *, what: str = "file") -> Any:
     """Return the content of a JSON file.
 
     Raises:
@@ -159,9 +147,7 @@ def read_json(
         raise InputError(f"cannot be read as JSON ({error})", path) from None
 
 
-def read_xml(
-    path: str | Path, limit: float = FILE_LIMITS.text_bytes, *, what: str = "file"
-) -> Element:
+def read_xml(path: str | Path, limit: float = TEXT_BYTES, *, what: str = "file") -> Element:
     """Return the root element of an XML file.
 
     Raises:
@@ -225,8 +211,8 @@ class _ShallowBuilder(TreeBuilder):
     def start(self, tag: str, attrs: dict[str, str], /) -> Element:
         """Open an element."""
         self._depth += 1
-        if self._depth > FILE_LIMITS.xml_depth:
-            raise InputError(f"nests elements more than {FILE_LIMITS.xml_depth} deep", self._path)
+        if self._depth > XML_DEPTH:
+            raise InputError(f"nests elements more than {XML_DEPTH} deep", self._path)
         return super().start(tag, attrs)
 
     def end(self, tag: str, /) -> Element:

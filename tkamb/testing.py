@@ -26,16 +26,9 @@ BLOCK = (32e-3, 10e-3, 56e-3)
 """m: lengths of the block along x, y and z."""
 
 
-@dataclass(frozen=True)
-class ModelCheckSettings:
-    """Tolerances of the check."""
-
-    stiffness_tolerance: float = 0.1
-    """1: largest relative difference between the stiffnesses over ±10 and ±5 % of the approach.
-    Chosen because the force has small steps when single nodes come into contact."""
-
-
-MODEL_CHECK = ModelCheckSettings()
+# 1: largest relative difference between the stiffnesses over ±10 and ±5 % of the approach. Chosen
+# because the force has small steps when single nodes come into contact.
+STIFFNESS_TOLERANCE = 0.1
 
 
 class ConformanceError(TkambError):
@@ -251,7 +244,7 @@ def _check_stiffness(
     wide = (forces[4] - forces[0]) / (steps[4] - steps[0])
     narrow = (forces[3] - forces[1]) / (steps[3] - steps[1])
     _require(
-        _close(wide, narrow, MODEL_CHECK.stiffness_tolerance, narrow),
+        _close(wide, narrow, STIFFNESS_TOLERANCE, narrow),
         "the stiffness by finite differences converges as the step shrinks",
         f"{wide:.4g} and {narrow:.4g} N/m",
     )

@@ -6,7 +6,7 @@ from typing import Any
 
 from error_cases import SITUATIONS
 from error_rows import COMPARED, ErrorRow
-from tkamb.run.known_errors import KNOWN_ERROR, STORED
+from tkamb.run.known_errors import LEAST_PAIRS, STORED
 
 HEADS = {
     "approach": "approach",
@@ -81,7 +81,7 @@ def stated_table(entries: Sequence[Mapping[str, Any]]) -> list[str]:
         "| --- | --- | ---: |" + " ---: |" * (len(names) + 5),
     ]
     for entry in entries:
-        few = entry["pairs"] < KNOWN_ERROR.least_pairs or not entry["range"]
+        few = entry["pairs"] < LEAST_PAIRS or not entry["range"]
         shares = ["–" if few or entry[n] is None else f"{100 * entry[n]:.2g}" for n in names]
         ends = [entry["range"].get(n) for n in ("thickness_over_radius", "poisson_ratio")]
         spans = [

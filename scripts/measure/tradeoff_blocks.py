@@ -21,7 +21,7 @@ from tkamb.show.tradeoff_report import (
 )
 from tkamb.studies.body_trade import HEADS as BODY_HEADS
 from tkamb.studies.body_trade import BodyRow
-from tkamb.studies.tradeoff import KEYS, TIMING, Row, beats, on_front
+from tkamb.studies.tradeoff import EQUAL_RATIO, KEYS, Row, beats, on_front
 
 MARKERS = "<!-- {}:begin -->", "<!-- {}:end -->"
 HEADS = ("approach", "condyle force", "mean p", "peak p", "area", "map L2")
@@ -261,7 +261,7 @@ def moved(first: Sequence[tuple[float, float]], second: Sequence[tuple[float, fl
     """Return the points that moved onto or off the front without a tie.
 
     A move is a tie if each point that beats the moved point, where that is off the front, has an
-    equal time (within `TIMING.equal_ratio`) in one of the two measurements.
+    equal time (within `EQUAL_RATIO`) in one of the two measurements.
 
     Args:
         first: (seconds, error) of each point.
@@ -280,4 +280,4 @@ def moved(first: Sequence[tuple[float, float]], second: Sequence[tuple[float, fl
 
 
 def _tied(one: tuple[float, float], other: tuple[float, float]) -> bool:
-    return max(one[0], other[0]) <= TIMING.equal_ratio * min(one[0], other[0])
+    return max(one[0], other[0]) <= EQUAL_RATIO * min(one[0], other[0])

@@ -124,7 +124,7 @@ def _export_figures(options: argparse.Namespace) -> int:
 
 
 def _export_deck(options: argparse.Namespace) -> int:
-    from tkamb.contact.registry import MAP_GRID
+    from tkamb.contact.registry import COARSEST
     from tkamb.files import write_text
     from tkamb.io.claim import check_output_file
     from tkamb.run.frame_press import SUFFIX, frame_press
@@ -132,7 +132,7 @@ def _export_deck(options: argparse.Namespace) -> int:
     if options.out.suffix.lower() != SUFFIX[options.deck]:
         suffix = SUFFIX[options.deck]
         raise InputError(f"is not a {suffix} file", options.out, f"give a name like frame{suffix}")
-    coarsest_mm = MAP_GRID.coarsest / MILLIMETRE
+    coarsest_mm = COARSEST / MILLIMETRE
     if options.resolution is not None and not 0 < options.resolution <= coarsest_mm:
         hint = f"give more than 0, at most {coarsest_mm:g} mm"
         raise InputError(f"resolution {options.resolution} mm", "--resolution", hint)

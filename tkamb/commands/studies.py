@@ -4,23 +4,14 @@ import argparse
 import json
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 from tkamb.run.guard import say
 
-
-@dataclass(frozen=True)
-class CohortOutputSettings:
-    """Length of the output of `tkamb cohort`."""
-
-    max_failed_runs: int = 10
-    """Largest number of failed runs that are printed; the folder lists all. Chosen because ten
-    lines fit on a screen."""
-
-
-COHORT_OUTPUT = CohortOutputSettings()
+# Largest number of failed runs that are printed; the folder lists all. Chosen because ten lines
+# fit on a screen.
+MAX_FAILED_RUNS = 10
 
 
 def add_cohort(commands: Any) -> None:
@@ -80,10 +71,10 @@ def _cohort(options: argparse.Namespace) -> int:
         report=cohort_html,
     )
     failed = [n for n, outcome in outcomes.items() if outcome.reason]
-    for n in failed[: COHORT_OUTPUT.max_failed_runs]:
+    for n in failed[:MAX_FAILED_RUNS]:
         say(f"run {n} ({cohort.runs[n].words()}): {outcomes[n].reason}")
-    if len(failed) > COHORT_OUTPUT.max_failed_runs:
-        say(f"{len(failed) - COHORT_OUTPUT.max_failed_runs} more failed runs: see runs.csv")
+    if len(failed) > MAX_FAILED_RUNS:
+        say(f"{len(failed) - MAX_FAILED_RUNS} more failed runs: see runs.csv")
     print(f"{len(outcomes) - len(failed)} of {len(outcomes)} runs computed")
     if part is None:
         print(f"report: {directory / REPORT_NAME}")

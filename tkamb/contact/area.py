@@ -1,28 +1,18 @@
 """The area of a surface that is in contact, and the area above a given pressure."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from tkamb.contact.materials import Material
 from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.frames import Array, Index
 
-
-@dataclass(frozen=True)
-class ContactAreaSettings:
-    """Contact area from nodal pressures and gaps."""
-
-    unknown_edge_share: float = 0.5
-    """1: share of a triangle's side that counts as in contact where the edge of contact is unknown:
-    the femoral surface ends between the side's nodes, or is steeper than 45 deg. Chosen because
-    contact may end anywhere between the nodes."""
-    least_gap: float = 1e-12
-    """m: smallest gap of a node that is not in contact. Chosen because it prevents a division by
-    zero; gaps that matter are above 1e-7 m."""
-
-
-CONTACT_AREA = ContactAreaSettings()
+# 1: share of a triangle's side that counts as in contact where the edge of contact is unknown: the
+# femoral surface ends between the side's nodes, or is steeper than 45 deg. Chosen because contact
+# may end anywhere between the nodes.
+UNKNOWN_EDGE_SHARE = 0.5
+# m: smallest gap of a node that is not in contact. Chosen because it prevents a division by zero;
+# gaps that matter are above 1e-7 m.
+LEAST_GAP = 1e-12
 
 
 def covered_areas(
@@ -98,7 +88,7 @@ def _share(
 
     distance = np.linalg.norm(points[inside] - points[outside], axis=2)
     smooth = gap[outside] < distance
-    opening = np.where(smooth, np.maximum(gap[outside], CONTACT_AREA.least_gap), distance)
+    opening = np.where(smooth, np.maximum(gap[outside], LEAST_GAP), distance)
     modulus = material.young_modulus / (1.0 - material.poisson_ratio**2)
     # Inside the edge p² is proportional to the distance d, outside the gap is proportional to
     # d^(3/2). Both laws share the factor C, which determines the place of the edge.
@@ -106,9 +96,7 @@ def _share(
     scale = np.sqrt(rise / (3.0 * square))
     # Closed form of the only real root of the cubic, without cancellation for small gaps.
     root = 2.0 * scale * np.sinh(np.arcsinh(1.5 * distance / (rise * scale)) / 3.0)
-    return np.where(
-        smooth, np.minimum(square * root**3 / distance, 1.0), CONTACT_AREA.unknown_edge_share
-    )
+    return np.where(smooth, np.minimum(square * root**3 / distance, 1.0), UNKNOWN_EDGE_SHARE)
 
 
 def area_above(points: Array, triangles: Index, pressure: Array, level: float) -> float:

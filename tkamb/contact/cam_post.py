@@ -38,19 +38,13 @@ TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 UP = np.array([0.0, 1.0, 0.0])
 
 
-@dataclass(frozen=True)
-class CamPostSettings:
-    """Contact of cam and post."""
+# m: height above the post at which rays along -y' begin. Chosen because it is well above the noise
+# of a mesh.
+RAY_START_HEIGHT = 1e-3
+# m: distance beside the post up to which triangles belong to the cam. Chosen because the femur
+# moves from side to side.
+SEARCH_MARGIN = 3 * MILLIMETRE
 
-    ray_start_height: float = 1e-3
-    """m: height above the post at which rays along -y' begin. Chosen because it is well above the
-    noise of a mesh."""
-    search_margin: float = 3 * MILLIMETRE
-    """m: distance beside the post up to which triangles belong to the cam. Chosen because the femur
-    moves from side to side."""
-
-
-CAM_POST = CamPostSettings()
 
 TICKS, ZOOMS = 41, 3
 """Number of rays along each edge of a search grid, and number of grids. Each grid is twenty times
@@ -96,7 +90,7 @@ class PostPair(ContactPair):
         far, back = float(np.abs(self.femoral.bounds).max()), inverse(pose)
         below = points + (pose[1, 3] - 2 * far) * UP
         up, _ = self.femoral.rays.first(transform(back, below), rotate(back, UP))
-        above = points + (self.insert.bounds[1, 1] + CAM_POST.ray_start_height) * UP
+        above = points + (self.insert.bounds[1, 1] + RAY_START_HEIGHT) * UP
         down, _ = self.insert.rays.first(above, -UP)
         gap = (below[:, 1] + up) - (above[:, 1] - down)
         return np.where(np.isfinite(gap), gap, np.nan)
@@ -165,7 +159,7 @@ class CamPost:
         front = np.array([high[0], (low[1] + high[1]) / 2, (low[2] + high[2]) / 2])
         self.in_turned = np.eye(4)
         self.in_turned[:3, :3], self.in_turned[:3, 3] = TURN, -TURN @ front
-        cam = cam_of(femoral, split, (high[2] - low[2]) / 2 + CAM_POST.search_margin)
+        cam = cam_of(femoral, split, (high[2] - low[2]) / 2 + SEARCH_MARGIN)
         self._foot = float(low[1])
         self._prepare(model, PostPair(cam, post.moved(self.in_turned), material))
 

@@ -22,17 +22,10 @@ TOO_NARROW = "contact is too narrow"
 """Text of the flag after "the <side> "."""
 
 
-@dataclass(frozen=True)
-class NarrowContactSettings:
-    """Definition of a contact that is too narrow for the map's points."""
-
-    least_inner_points: int = 5
-    """Smallest number of inner points: map points with contact all around. With this number a
-    sphere touches about 17 points, and the error of the peak is at most 8 %. Without inner points
-    the peak of a lattice is 5 to 96 % too low (docs/lattice.md)."""
-
-
-NARROW_CONTACT = NarrowContactSettings()
+# Smallest number of inner points: map points with contact all around. With this number a sphere
+# touches about 17 points, and the error of the peak is at most 8 %. Without inner points the peak
+# of a lattice is 5 to 96 % too low (docs/lattice.md).
+LEAST_INNER_POINTS = 5
 
 
 def narrow_flags(
@@ -51,10 +44,7 @@ def narrow_flags(
     """
     inner = surrounded(triangles, touched)
     for side, under_side in sides.items():
-        if (
-            touched[under_side].any()
-            and np.count_nonzero(inner & under_side) < NARROW_CONTACT.least_inner_points
-        ):
+        if touched[under_side].any() and np.count_nonzero(inner & under_side) < LEAST_INNER_POINTS:
             yield (
                 f"the {side} {TOO_NARROW} for the {points}: its peak pressure cannot be "
                 f"relied on; take finer {points}"
@@ -193,22 +183,17 @@ def edge_of_insert_flags(
         yield (f"the {side} {AT_EDGE} (within {settings.reach / MILLIMETRE:g} mm); {where}")
 
 
-@dataclass(frozen=True)
-class MeshFlagSettings:
-    """When a defect of a mesh changes a contact."""
-
-    reach_cells: float = 1.5
-    """1: distance from a loaded point, in cells of the map, below which a defect is reached.
-    Chosen: a cell and its diagonal."""
-    noisy_share: float = 0.5
-    """1: share of a body's vertices in the contact that are noisy, from which it is flagged. Chosen
-    because a crease beside a contact makes fewer of them rough."""
-    bottom: float = 0.1 * MILLIMETRE
-    """m: height above the bottom up to which a column counts as standing on it. Chosen above the
-    flatness of machined bottoms."""
+# 1: distance from a loaded point, in cells of the map, below which a defect is reached. Chosen: a
+# cell and its diagonal.
+REACH_CELLS = 1.5
+# 1: share of a body's vertices in the contact that are noisy, from which it is flagged. Chosen
+# because a crease beside a contact makes fewer of them rough.
+NOISY_SHARE = 0.5
+# m: height above the bottom up to which a column counts as standing on it. Chosen above the
+# flatness of machined bottoms.
+BOTTOM = 0.1 * MILLIMETRE
 
 
-MESH_FLAG = MeshFlagSettings()
 MESH_DEFECT = "the contact reaches a defect of the"
 """Text of the flag before " <body> mesh"."""
 UNSUPPORTED = "contact lies over an unsupported bottom"
@@ -235,7 +220,7 @@ def mesh_flags(
     if not loaded.any():
         return
     # Half a millimetre for the approach, which moves the femoral surface below the map points.
-    reach = MESH_FLAG.reach_cells * float(np.sqrt(np.median(area[loaded]))) + 0.5 * MILLIMETRE
+    reach = REACH_CELLS * float(np.sqrt(np.median(area[loaded]))) + 0.5 * MILLIMETRE
     contact = cKDTree(points[loaded])
     for name, (surface, pose) in bodies.items():
         reached: list[Defect] = []
@@ -245,7 +230,7 @@ def mesh_flags(
             if defect.kind == "noise" and within.any():
                 own = transform(pose, surface.vertices)
                 near = contact.query(own, distance_upper_bound=reach)[0] <= reach
-                within &= within.sum() > MESH_FLAG.noisy_share * near.sum()
+                within &= within.sum() > NOISY_SHARE * near.sum()
             if within.any() or (defect.kind == "opening" and _below(places, points, reach)):
                 reached.append(defect)
         for words in defect_words(reached):
@@ -278,7 +263,7 @@ def unsupported_flags(
         start = points[loaded] - [0.0, MILLIMETRE / 100.0, 0.0]
         below = insert.rays.first(start, DOWN)[0]
         height = start[:, 1] - below - insert.bounds[0, 1]
-        if (np.isfinite(below) & (height > MESH_FLAG.bottom)).any():
+        if (np.isfinite(below) & (height > BOTTOM)).any():
             yield (
                 f"the {side} {UNSUPPORTED}: the columns stand on the fixed bottom, so that "
                 "stiffness and pressure are too high there; the stated error does not apply"

@@ -26,29 +26,23 @@ from tkamb.units import MILLIMETRE
 Law = Literal["nonlinear", "linear"]
 
 
-@dataclass(frozen=True)
-class FoundationSettings:
-    """The elastic foundation (bed of springs)."""
+# m: smallest thickness of the layer; at the rim it replaces smaller values. Chosen because it
+# keeps pressure = modulus * penetration / thickness finite.
+LEAST_THICKNESS = 1e-6
+# m: difference of two approaches below which their reactions count as equal. Chosen because with a
+# stiffness of about 1e8 N/m the reactions differ by 0.1 N.
+APPROACH_STEP = 1e-9
+# 1: cosine of the angle between column and femoral normal (84 deg) below which the column is not
+# loaded. Chosen like the least slope of a map point, `MAP_POINT.least_normal_y`: the force p A/(m
+# . n) would be more than ten times the pressure's.
+LEAST_COSINE = 0.1
+# 1: a reaction below `REACHED_SHARE` * load - `REACHED_FORCE` cannot rise to the load within
+# `APPROACH_STEP`. Chosen because map points that come into contact within this step raise the
+# reaction by less than 1 % of the load.
+REACHED_SHARE = 0.99
+# N: see `REACHED_SHARE`. Chosen: ten times the reaction's change within `APPROACH_STEP`.
+REACHED_FORCE = 1.0
 
-    least_thickness: float = 1e-6
-    """m: smallest thickness of the layer; at the rim it replaces smaller values. Chosen because it
-    keeps pressure = modulus * penetration / thickness finite."""
-    approach_step: float = 1e-9
-    """m: difference of two approaches below which their reactions count as equal. Chosen because
-    with a stiffness of about 1e8 N/m the reactions differ by 0.1 N."""
-    least_cosine: float = 0.1
-    """1: cosine of the angle between column and femoral normal (84 deg) below which the column is
-    not loaded. Chosen like the least slope of a map point, `MAP_POINT.least_normal_y`: the force
-    p A/(m . n) would be more than ten times the pressure's."""
-    reached_share: float = 0.99
-    """1: a reaction below `reached_share` * load - `reached_force` cannot rise to the load within
-    `approach_step`. Chosen because map points that come into contact within this step raise the
-    reaction by less than 1 % of the load."""
-    reached_force: float = 1.0
-    """N: see `reached_share`. Chosen: ten times the reaction's change within `approach_step`."""
-
-
-FOUNDATION = FoundationSettings()
 
 TOO_DEEP = "the penetration exceeds half the insert's thickness"
 OVER_THE_EDGE = (
@@ -129,12 +123,12 @@ class ElasticFoundation(ContactModel):
         samples = state.surface
         meeting = meet(samples, state.pair.femoral, pose)
         gap = meeting.gap
-        strain = np.maximum(-gap, 0.0) / np.maximum(samples.thickness, FOUNDATION.least_thickness)
+        strain = np.maximum(-gap, 0.0) / np.maximum(samples.thickness, LEAST_THICKNESS)
         if (deep := strain >= DEEPEST).any():
             full_depth = (samples.depth >= samples.thickness)[deep].any()
             k = int(strain.argmax())
             words = TOO_DEEP if full_depth else OVER_THE_EDGE
-            thickness = max(float(samples.thickness[k]), FOUNDATION.least_thickness)
+            thickness = max(float(samples.thickness[k]), LEAST_THICKNESS)
             # No ray ends in a column that lies wholly inside the femur: its gap is -inf.
             depth = -gap[k] if np.isfinite(gap[k]) else state.pair.approach(pose)
             limit = DEEPEST * thickness / MILLIMETRE
@@ -181,15 +175,12 @@ class ElasticFoundation(ContactModel):
         One evaluation of all columns, at the largest approach in range, is therefore enough: it
         gives the largest reaction in range.
         """
-        if nearby.beyond - nearby.within > FOUNDATION.approach_step:
+        if nearby.beyond - nearby.within > APPROACH_STEP:
             return False
         pose = nearby.state.pair.pose_at_approach(nearby.pose, nearby.within)
         result = self.evaluate(nearby.state, pose)
         reaction = -float(result.wrench_on_insert[1])
-        return (
-            result.status is ContactStatus.OK
-            and reaction < FOUNDATION.reached_share * load - FOUNDATION.reached_force
-        )
+        return result.status is ContactStatus.OK and reaction < REACHED_SHARE * load - REACHED_FORCE
 
     def probe(self, state: SampledContact, guess: Guess | None = None) -> Any:
         """Return a probe that evaluates the near columns, with exact stiffness."""
@@ -224,10 +215,10 @@ class _NearColumns:
     def reaction(self, approach: float) -> float:
         """Return the reaction (N) at an approach (m); inf where the approach is out of range.
 
-        When `within` and `beyond` differ by at most `FOUNDATION.approach_step`, the reaction
+        When `within` and `beyond` differ by at most `APPROACH_STEP`, the reaction
         between them is that at `within`.
         """
-        if self.within < approach < self.beyond <= self.within + FOUNDATION.approach_step:
+        if self.within < approach < self.beyond <= self.within + APPROACH_STEP:
             return self._last
         pair = self.state.pair
         pose = pair.pose_at_approach(self.pose, approach)
@@ -241,9 +232,7 @@ class _NearColumns:
         else:
             meeting = meet(self._near, pair.femoral, pose)
         near = self._near
-        strain = np.maximum(-meeting.gap, 0.0) / np.maximum(
-            near.thickness, FOUNDATION.least_thickness
-        )
+        strain = np.maximum(-meeting.gap, 0.0) / np.maximum(near.thickness, LEAST_THICKNESS)
         if (strain >= DEEPEST).any():
             self.beyond = min(self.beyond, approach)
             return np.inf
@@ -258,7 +247,7 @@ class _NearColumns:
 def grazing(samples: SurfaceSamples, meeting: Meeting) -> Mask:
     """Return whether columns (n,) meet the femoral surface edge on, or not at all."""
     cosine = np.einsum("ij,ij->i", samples.normals, meeting.gradient)
-    return cosine > -FOUNDATION.least_cosine
+    return cosine > -LEAST_COSINE
 
 
 def forces_on_insert(samples: SurfaceSamples, meeting: Meeting, pressure: Array) -> Array:
@@ -345,7 +334,7 @@ class FoundationProbe:
         if not len(meeting.gap):
             through = self._state.pair.passed_through(pose) is not None
             return ProbedContact({}, known=not through, tangent=True)
-        strain = -meeting.gap / np.maximum(samples.thickness, FOUNDATION.least_thickness)
+        strain = -meeting.gap / np.maximum(samples.thickness, LEAST_THICKNESS)
         if not (strain < DEEPEST).all():
             return ProbedContact({}, known=False)
         force = layer_pressure(self._law, self._state.pair.material, strain) * samples.area
@@ -374,10 +363,10 @@ class FoundationProbe:
         gap, length = meeting.gap, np.linalg.norm(meeting.gradient, axis=1)
         cosine = np.abs(np.einsum("ij,ij->i", meeting.gradient, samples.normals)) / length
         change = samples.resolution * np.sqrt(np.maximum(1.0 - cosine**2, 0.0)) / cosine
-        edge = np.clip(change, FOUNDATION.approach_step, WIDEST_EDGE)
+        edge = np.clip(change, APPROACH_STEP, WIDEST_EDGE)
         share = np.clip(0.5 - gap / edge, 0.0, 1.0)
         within = replace(meeting, gap=np.minimum(gap, 0.0))
-        strain = -within.gap / np.maximum(samples.thickness, FOUNDATION.least_thickness)
+        strain = -within.gap / np.maximum(samples.thickness, LEAST_THICKNESS)
         force = layer_pressure(self._law, self._state.pair.material, strain) * samples.area
         sums = self._sums(samples, within, force, self._rate(samples, within.gap) * share, pose)
         condyles = {
@@ -394,7 +383,7 @@ class FoundationProbe:
 
     def _rate(self, samples: SurfaceSamples, gap: Array) -> Array:
         """Return the derivative (n,), N/m, of the columns' forces by their penetrations."""
-        thickness = np.maximum(samples.thickness, FOUNDATION.least_thickness)
+        thickness = np.maximum(samples.thickness, LEAST_THICKNESS)
         slope = layer_slope(self._law, self._state.pair.material, -gap / thickness)
         return slope * samples.area / thickness
 

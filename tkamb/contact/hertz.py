@@ -16,17 +16,9 @@ from tkamb.contact.samples import MAP_POINT, SampledContact, SurfaceSamples, gap
 from tkamb.geometry.frames import SIDES, Array, Index
 from tkamb.units import MILLIMETRE
 
-
-@dataclass(frozen=True)
-class EllipseSettings:
-    """Hertz's contact ellipse."""
-
-    smallest_axis_ratio: float = 1e-6
-    """1: smallest ratio of the semi-axes. Chosen because a smaller ratio is a line contact, where
-    elliptic integrals lose their digits."""
-
-
-ELLIPSE = EllipseSettings()
+# 1: smallest ratio of the semi-axes. Chosen because a smaller ratio is a line contact, where
+# elliptic integrals lose their digits.
+SMALLEST_AXIS_RATIO = 1e-6
 
 
 @dataclass(frozen=True)
@@ -91,25 +83,19 @@ def _axis_ratio(curvature_ratio: float) -> float:
     # Equal curvatures give a circle; rounding may put the root at a positive logarithm.
     if curvature_ratio <= 1.0 or excess(0.0) >= 0:
         return 1.0
-    return float(np.exp(brentq(excess, np.log(ELLIPSE.smallest_axis_ratio), 0.0, xtol=1e-15)))
+    return float(np.exp(brentq(excess, np.log(SMALLEST_AXIS_RATIO), 0.0, xtol=1e-15)))
 
 
-@dataclass(frozen=True)
-class HertzSettings:
-    """Hertz's contact of a condyle."""
+# Number of sub-cells along the ellipse's short semi-axis. The pressure of a map point is the mean
+# over the sub-cells of its cell. Chosen because the mean is then exact to 1 %.
+SHORT_AXIS_SUB_CELLS = 10
+# 1: smallest share of the patch's force that must lie on the insert. Chosen because with less the
+# contact extends over the rim, and Hertz's solution does not hold.
+LEAST_SHARE_ON_INSERT = 0.95
+# 1: smallest ratio of the two relative curvatures. Chosen because a smaller ratio is a line
+# contact.
+SMALLEST_CURVATURE_RATIO = 1e-6
 
-    short_axis_sub_cells: int = 10
-    """Number of sub-cells along the ellipse's short semi-axis. The pressure of a map point is the
-    mean over the sub-cells of its cell. Chosen because the mean is then exact to 1 %."""
-    least_share_on_insert: float = 0.95
-    """1: smallest share of the patch's force that must lie on the insert. Chosen because with less
-    the contact extends over the rim, and Hertz's solution does not hold."""
-    smallest_curvature_ratio: float = 1e-6
-    """1: smallest ratio of the two relative curvatures. Chosen because a smaller ratio is a line
-    contact."""
-
-
-HERTZ = HertzSettings()
 
 FEWEST_SUB_CELLS, MOST_SUB_CELLS = 6, 50
 """Smallest and largest number of sub-cells along an edge of a grid cell."""
@@ -195,7 +181,7 @@ class Hertz(ContactModel):
             flat, steep = geometry.contact.relative / 2
             patch = contact_ellipse(flat, steep, depth, plane_modulus)
             pressure[side], share = map_pressure(samples, geometry.contact, patch)
-            if share < HERTZ.least_share_on_insert:
+            if share < LEAST_SHARE_ON_INSERT:
                 return ContactResult.out_of_range(
                     state, pose, f"{SIDES[side]} contact ellipse leaves the insert"
                 )
@@ -251,7 +237,7 @@ def map_pressure(
     offset = samples.points - contact.point
     # The map must have the correct force along y, because a load prescribes this component.
     vertical_force = patch.force * contact.normal[1]
-    if patch.short_axis < samples.resolution / MOST_SUB_CELLS * HERTZ.short_axis_sub_cells:
+    if patch.short_axis < samples.resolution / MOST_SUB_CELLS * SHORT_AXIS_SUB_CELLS:
         nearest = int(np.einsum("ij,ij->i", offset, offset).argmin())
         pressure[nearest] = vertical_force / (samples.area[nearest] * samples.normals[nearest, 1])
         return pressure, 1.0
@@ -275,9 +261,7 @@ def _cell_means(
     patch: ContactEllipse,
 ) -> Array:
     """Return the mean of sqrt(1 - (u/a)² - (v/b)²) over the grid cells of points (m,)."""
-    needed_sub_cells = int(
-        np.ceil(HERTZ.short_axis_sub_cells * samples.resolution / patch.short_axis)
-    )
+    needed_sub_cells = int(np.ceil(SHORT_AXIS_SUB_CELLS * samples.resolution / patch.short_axis))
     count = min(max(needed_sub_cells, FEWEST_SUB_CELLS), MOST_SUB_CELLS)
     ticks = ((np.arange(count) + 0.5) / count - 0.5) * samples.resolution
     dx, dz = (grid.ravel() for grid in np.meshgrid(ticks, ticks))
@@ -351,7 +335,7 @@ def _geometry(
         )
         usable = (
             contact is not None
-            and contact.relative[0] > HERTZ.smallest_curvature_ratio * contact.relative[1]
+            and contact.relative[0] > SMALLEST_CURVATURE_RATIO * contact.relative[1]
         )
         condyles.append(CondyleGeometry(-touch.travel, contact if usable else None))
     return condyles[0], condyles[1]

@@ -8,7 +8,7 @@ group `tkamb.contact`:
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from tkamb.contact.model import ContactModel
@@ -16,19 +16,11 @@ from tkamb.contact.named_classes import NamedClasses
 from tkamb.errors import InputError, names_near
 from tkamb.units import MILLIMETRE
 
-
-@dataclass(frozen=True)
-class MapGridSettings:
-    """The spacing of a pressure map."""
-
-    coarsest: float = 10.0 * MILLIMETRE
-    """m: largest accepted spacing. Chosen because a condyle's contact is 5 to 20 mm across, and a
-    coarser map does not resolve it."""
-    usual: float = 1.0 * MILLIMETRE
-    """m: default spacing, as `contact.resolution_mm` of a scene."""
-
-
-MAP_GRID = MapGridSettings()
+# m: largest accepted spacing. Chosen because a condyle's contact is 5 to 20 mm across, and a
+# coarser map does not resolve it.
+COARSEST = 10.0 * MILLIMETRE
+# m: default spacing, as `contact.resolution_mm` of a scene.
+USUAL = 1.0 * MILLIMETRE
 
 
 OPTION_RANGES = {"tolerance": (1e-9, 0.1), "patch_radius": (5e-4, 3e-2)}
@@ -74,7 +66,7 @@ def contact_class(name: str) -> type[ContactModel]:
 def contact_model(
     name: str,
     *,
-    resolution: float = MAP_GRID.usual,
+    resolution: float = USUAL,
     **options: Any,
 ) -> ContactModel:
     """Return the contact model of a name.
@@ -89,8 +81,8 @@ def contact_model(
             positive or too coarse.
     """
     cls, where = contact_class(name), f"contact model '{name}'"
-    if not (math.isfinite(resolution) and 0 < resolution <= MAP_GRID.coarsest):
-        most = MAP_GRID.coarsest
+    if not (math.isfinite(resolution) and 0 < resolution <= COARSEST):
+        most = COARSEST
         hint = f"give more than 0, at most {most / MILLIMETRE:g} mm ({most:g} m)"
         raise InputError(f"resolution {resolution} m", where, hint)
     known_options = _options(cls)

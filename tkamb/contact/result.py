@@ -21,24 +21,16 @@ from tkamb.contact.pair import ContactPair, ContactSurface, PreparedContact
 from tkamb.geometry.frames import Array, Mask
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
-
-@dataclass(frozen=True)
-class ContactResultSettings:
-    """Limits beyond which a contact result is flagged."""
-
-    max_measured_pressure: float = 100.0 * MEGAPASCAL
-    """Pa: peak pressure above which a result is flagged. Chosen because measured stress-strain
-    curves of polyethylene end at 40 to 60 MPa, and the largest von Mises stress of a Hertz contact
-    is about 0.6 of its peak pressure."""
-    least_patch_share: float = 0.05
-    """1: a patch that carries a smaller share of the force does not count as contact of a second
-    condyle. Chosen because such a patch is a fragment of the first condyle's contact."""
-    least_patch_distance: float = 15.0 * MILLIMETRE
-    """m: smallest distance between the centres of two condyles' patches. Chosen because condyles of
-    a knee are 40 to 50 mm apart."""
-
-
-CONTACT_RESULT = ContactResultSettings()
+# Pa: peak pressure above which a result is flagged. Chosen because measured stress-strain curves
+# of polyethylene end at 40 to 60 MPa, and the largest von Mises stress of a Hertz contact is about
+# 0.6 of its peak pressure.
+MAX_MEASURED_PRESSURE = 100.0 * MEGAPASCAL
+# 1: a patch that carries a smaller share of the force does not count as contact of a second
+# condyle. Chosen because such a patch is a fragment of the first condyle's contact.
+LEAST_PATCH_SHARE = 0.05
+# m: smallest distance between the centres of two condyles' patches. Chosen because condyles of a
+# knee are 40 to 50 mm apart.
+LEAST_PATCH_DISTANCE = 15.0 * MILLIMETRE
 
 
 class ContactStatus(Enum):
@@ -295,8 +287,8 @@ def patch_flags(surface: ContactSurface, pressure: Array, nodal_force: Array) ->
     """Yield a flag where a component with one condyle presses on two separate patches.
 
     A patch is a set of loaded points that the map's triangles connect. Each of the two patches
-    carries more than `CONTACT_RESULT.least_patch_share` of the force. Their centres are more than
-    `CONTACT_RESULT.least_patch_distance` apart.
+    carries more than `LEAST_PATCH_SHARE` of the force. Their centres are more than
+    `LEAST_PATCH_DISTANCE` apart.
 
     Args:
         surface: the map's points and triangles.
@@ -313,12 +305,12 @@ def patch_flags(surface: ContactSurface, pressure: Array, nodal_force: Array) ->
     patch = connected_components(graph, directed=False)[1][loaded]
     weight = np.linalg.norm(nodal_force[loaded], axis=1)
     force = np.bincount(patch, weight)
-    large = np.flatnonzero(force > CONTACT_RESULT.least_patch_share * force.sum())
+    large = np.flatnonzero(force > LEAST_PATCH_SHARE * force.sum())
     centres = np.array(
         [np.bincount(patch, weight * x)[large] / force[large] for x in surface.points[loaded].T]
     ).T
     distance = np.linalg.norm(centres[:, None] - centres, axis=2).max(initial=0.0)
-    if distance > CONTACT_RESULT.least_patch_distance:
+    if distance > LEAST_PATCH_DISTANCE:
         yield (
             f"contact in separate patches {distance / MILLIMETRE:.0f} mm apart, but the femoral "
             "component shows one condyle: all of it is called medial; check the meshes' axes"
@@ -365,7 +357,7 @@ def thickness_under(position: Array, points: Array, thickness: Array) -> float:
 
 def peak_flags(sides: dict[str, CondyleContact | None]) -> Iterator[str]:
     """Yield a flag for each condyle with a peak pressure beyond measured stress-strain curves."""
-    limit = CONTACT_RESULT.max_measured_pressure
+    limit = MAX_MEASURED_PRESSURE
     for side, condyle in sides.items():
         if condyle is not None and condyle.peak_pressure > limit:
             yield (

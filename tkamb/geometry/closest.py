@@ -15,25 +15,17 @@ from tkamb.geometry.nearest import NearestPoints, sampled
 from tkamb.geometry.surface import Surface
 from tkamb.units import MILLIMETRE
 
-
-@dataclass(frozen=True)
-class HeightBoundSettings:
-    """The grid of planes that bounds a surface's height from above."""
-
-    cell_edge: float = 1e-3
-    """m: edge of a cell. Chosen: about the edge of a mesh's triangles."""
-    most_cells: int = 400
-    """Largest number of cells along an edge of the grid; a larger surface gets larger cells. Chosen
-    because it limits memory."""
-    wide_triangle_cells: int = 4
-    """Number of cells along x or z. Triangles that span more are processed one by one. Chosen
-    because such triangles are few."""
-    largest_slope: float = 3.0
-    """1: largest slope of a plane that bounds the height. Chosen because the bound of a steeper
-    plane is loose."""
-
-
-HEIGHT_BOUND = HeightBoundSettings()
+# m: edge of a cell. Chosen: about the edge of a mesh's triangles.
+CELL_EDGE = 1e-3
+# Largest number of cells along an edge of the grid; a larger surface gets larger cells. Chosen
+# because it limits memory.
+MOST_CELLS = 400
+# Number of cells along x or z. Triangles that span more are processed one by one. Chosen because
+# such triangles are few.
+WIDE_TRIANGLE_CELLS = 4
+# 1: largest slope of a plane that bounds the height. Chosen because the bound of a steeper plane
+# is loose.
+LARGEST_SLOPE = 3.0
 
 
 class HeightBound:
@@ -51,9 +43,7 @@ class HeightBound:
     def __init__(self, surface: Surface) -> None:
         low, high = surface.bounds[:, [0, 2]]
         self._origin = low
-        self._edge = max(
-            HEIGHT_BOUND.cell_edge, float((high - low).max()) / HEIGHT_BOUND.most_cells
-        )
+        self._edge = max(CELL_EDGE, float((high - low).max()) / MOST_CELLS)
         self._last = ((high - low) // self._edge).astype(np.int64)
         self._cells = self._cell_planes(surface)
 
@@ -79,9 +69,7 @@ class HeightBound:
             np.add.at(total, cells, area[chosen])
         planes = np.full(total.shape, -np.inf)
         upward = np.maximum(total[..., 1:2], 1e-300)
-        planes[..., :2] = np.clip(
-            -total[..., ::2] / upward, -HEIGHT_BOUND.largest_slope, HEIGHT_BOUND.largest_slope
-        )
+        planes[..., :2] = np.clip(-total[..., ::2] / upward, -LARGEST_SLOPE, LARGEST_SLOPE)
         for chosen, cells in covered:
             rise = (planes[cells][:, None, :2] * xz[chosen]).sum(axis=2)
             np.maximum.at(planes[..., 2], cells, (heights[chosen] - rise).max(axis=1))
@@ -97,15 +85,15 @@ class HeightBound:
             high: (n, 2) m, largest x and z of the rectangles.
         """
         first, last = self._place(low), self._place(high)
-        wide = (last - first >= HEIGHT_BOUND.wide_triangle_cells).any(axis=1)
+        wide = (last - first >= WIDE_TRIANGLE_CELLS).any(axis=1)
         for t in np.flatnonzero(wide):
             rows, columns = (np.arange(first[t, k], last[t, k] + 1) for k in (0, 1))
             cells = np.repeat(rows, len(columns)), np.tile(columns, len(rows))
             yield np.full(len(cells[0]), t), cells
         small = np.flatnonzero(~wide)
         first, last = first[small], last[small]
-        for i in range(HEIGHT_BOUND.wide_triangle_cells):
-            for j in range(HEIGHT_BOUND.wide_triangle_cells):
+        for i in range(WIDE_TRIANGLE_CELLS):
+            for j in range(WIDE_TRIANGLE_CELLS):
                 inside = (first[:, 0] + i <= last[:, 0]) & (first[:, 1] + j <= last[:, 1])
                 yield small[inside], (first[inside, 0] + i, first[inside, 1] + j)
 

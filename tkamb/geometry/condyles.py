@@ -49,33 +49,27 @@ class CondyleSettings:
 CONDYLE = CondyleSettings()
 
 
-@dataclass(frozen=True)
-class ShellSettings:
-    """The search for the front and the bone side of a femoral component from its shape."""
+# 1: smallest share of the surface that faces the middle of the bounding box, the inner surface of
+# a shell. Measured: 0.41 to 0.44 in nine femoral components, at most 0.24 in inserts, 0 in convex
+# bodies.
+LEAST_INNER_SHARE = 0.33
+# 1: smallest magnitude of the sum of the inner surface's area vectors, as a share of its area. A
+# smaller sum shows no opening. Chosen below the 0.38 to 0.52 of nine femoral components; two
+# spheres side by side have 0.
+LEAST_OPENING_SHARE = 0.3
+# rad: angle of the opening's direction from superior towards posterior. Measured: 11 to 30 deg in
+# nine femoral components.
+OPENING_LEAN = 20.0 * DEGREE
+# 1: half the width of the strip between the condyles in which the flange is searched, as a share
+# of the component's width. Chosen because it is narrower than the notch.
+FLANGE_WIDTH_SHARE = 0.1
+# 1: smallest position of the flange along the component, as a share of the length from behind.
+# Chosen below the 0.87 to 0.94 of nine femoral components.
+FLANGE_POSITION = 0.75
+# rad: if the opening's direction is farther from the sagittal plane, the axes are wrong. Measured:
+# at most 2 deg in nine femoral components.
+SIDEWAYS = 45.0 * DEGREE
 
-    least_inner_share: float = 0.33
-    """1: smallest share of the surface that faces the middle of the bounding box, the inner surface
-    of a shell. Measured: 0.41 to 0.44 in nine femoral components, at most 0.24 in inserts, 0 in
-    convex bodies."""
-    least_opening_share: float = 0.3
-    """1: smallest magnitude of the sum of the inner surface's area vectors, as a share of its area.
-    A smaller sum shows no opening. Chosen below the 0.38 to 0.52 of nine femoral components; two
-    spheres side by side have 0."""
-    opening_lean: float = 20.0 * DEGREE
-    """rad: angle of the opening's direction from superior towards posterior. Measured: 11 to 30 deg
-    in nine femoral components."""
-    flange_width_share: float = 0.1
-    """1: half the width of the strip between the condyles in which the flange is searched, as a
-    share of the component's width. Chosen because it is narrower than the notch."""
-    flange_position: float = 0.75
-    """1: smallest position of the flange along the component, as a share of the length from behind.
-    Chosen below the 0.87 to 0.94 of nine femoral components."""
-    sideways: float = 45.0 * DEGREE
-    """rad: if the opening's direction is farther from the sagittal plane, the axes are wrong.
-    Measured: at most 2 deg in nine femoral components."""
-
-
-SHELL = ShellSettings()
 
 _FLEXIONS = np.radians(np.arange(0.0, 121.0, 15.0))
 
@@ -221,16 +215,16 @@ def orientation(femoral: Surface, pose: Array) -> Orientation | None:
     inner = np.einsum("kj,kj->k", femoral.face_normals, centroids - middle) < 0.0
     areas = femoral.areas
     outward, inner_area = areas[inner] @ femoral.face_normals[inner], areas[inner].sum()
-    if inner_area < SHELL.least_inner_share * areas.sum():
+    if inner_area < LEAST_INNER_SHARE * areas.sum():
         return None
-    if np.linalg.norm(outward) < SHELL.least_opening_share * inner_area:
+    if np.linalg.norm(outward) < LEAST_OPENING_SHARE * inner_area:
         return None
-    if abs(outward[2]) > np.sin(SHELL.sideways) * np.linalg.norm(outward):
+    if abs(outward[2]) > np.sin(SIDEWAYS) * np.linalg.norm(outward):
         return Orientation(0.0, np.pi / 2, 0.0)
     opening = outward[:2] / np.linalg.norm(outward[:2])
     across = np.array([opening[1], -opening[0]])  # anterior if the component is upright
     along, height = (femoral.vertices[:, :2] @ axis for axis in (across, opening))
-    half_width = SHELL.flange_width_share * np.ptp(femoral.vertices[:, 2])
+    half_width = FLANGE_WIDTH_SHARE * np.ptp(femoral.vertices[:, 2])
     strip = (np.abs(centroids[:, 2] - middle[2]) < half_width) & (
         centroids[:, :2] @ opening > 0.5 * (height.min() + height.max())
     )
@@ -238,10 +232,10 @@ def orientation(femoral: Surface, pose: Array) -> Orientation | None:
         return None
     flange = float(areas[strip] @ (centroids[strip, :2] @ across) / areas[strip].sum())
     position = (flange - along.min()) / np.ptp(along)
-    if abs(position - 0.5) < SHELL.flange_position - 0.5:
+    if abs(position - 0.5) < FLANGE_POSITION - 0.5:
         return None
     front = across if position > 0.5 else -across
-    cosine, sine = np.cos(SHELL.opening_lean), np.sin(SHELL.opening_lean)
+    cosine, sine = np.cos(OPENING_LEAN), np.sin(OPENING_LEAN)
     superior = np.append(cosine * opening + sine * front, 0.0)
     anterior = np.append(cosine * front - sine * opening, 0.0)
     up = rotate(pose, superior)

@@ -16,23 +16,15 @@ from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.surface import Surface
 from tkamb.geometry.topology import Ragged, edge_use
 
-
-@dataclass(frozen=True)
-class SubdivisionSettings:
-    """The search for flat subdivisions of coarser triangles."""
-
-    halving_tolerance: float = 1e-6
-    """1: largest distance of a vertex from the middle of a coarser edge, as a share of the
-    surface's size. Chosen because files round coordinates by less."""
-    most_levels: int = 8
-    """Largest number of subdivisions that are undone. Chosen because 8 subdivisions make 65,536
-    triangles of one."""
-    most_parts: int = 100
-    """Largest number of connected parts; a surface of more parts stays unchanged. Chosen because no
-    implant has as many."""
-
-
-SUBDIVISION = SubdivisionSettings()
+# 1: largest distance of a vertex from the middle of a coarser edge, as a share of the surface's
+# size. Chosen because files round coordinates by less.
+HALVING_TOLERANCE = 1e-6
+# Largest number of subdivisions that are undone. Chosen because 8 subdivisions make 65,536
+# triangles of one.
+MOST_LEVELS = 8
+# Largest number of connected parts; a surface of more parts stays unchanged. Chosen because no
+# implant has as many.
+MOST_PARTS = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +48,7 @@ def coarsened(surface: Surface) -> Coarsened | None:
     Each connected part is examined separately. Its subdivision is undone as a whole or not at all.
     """
     coarse: Coarsened | None = None
-    for _ in range(SUBDIVISION.most_levels):
+    for _ in range(MOST_LEVELS):
         step = _coarsened_once(surface if coarse is None else coarse.surface)
         if step is None:
             break
@@ -72,7 +64,7 @@ def _coarsened_once(surface: Surface) -> Coarsened | None:
     faces = surface.faces
     across = _across(faces)
     count, part = _parts(across)
-    if count > SUBDIVISION.most_parts:
+    if count > MOST_PARTS:
         return None
     search = _Search(surface, across)
     middles = [search.middles_of(np.flatnonzero(part == number)) for number in range(count)]
@@ -103,9 +95,7 @@ class _Search:
 
     def __init__(self, surface: Surface, across: Index) -> None:
         self._faces, self._points, self._across = surface.faces, surface.vertices, across
-        self._near = SUBDIVISION.halving_tolerance * float(
-            np.linalg.norm(np.ptp(surface.bounds, axis=0))
-        )
+        self._near = HALVING_TOLERANCE * float(np.linalg.norm(np.ptp(surface.bounds, axis=0)))
         self._corners = Ragged.by_key(surface.faces.ravel(), len(surface.vertices))
 
     def tips(self, middle: Index) -> Index:

@@ -22,47 +22,40 @@ if TYPE_CHECKING:
 Kind = Literal["opening", "spike", "noise", "steps"]
 
 
-@dataclass(frozen=True)
-class DefectSettings:
-    """Definition of a defect of a surface."""
-
-    neighbours: int = 18
-    """Number of nearest vertices for a quadric: three times its six coefficients."""
-    spike: float = 0.05 * MILLIMETRE
-    """m: smallest height of a spike whose triangles have all their vertices among the nearest ones.
-    Chosen above the largest difference of 0.03 mm on the dishes of three inserts."""
-    spike_of_fan: float = 0.2 * MILLIMETRE
-    """m: smallest height of another spike. Chosen above the largest difference of 0.12 mm on the
-    dishes of the same inserts; the nearest vertices then lie on one side."""
-    least_ring: int = 3
-    """Smallest number of nearest vertices that share a triangle with a spike. By definition of a
-    tip on a surface."""
-    spike_ratio: float = 6.0
-    """1: smallest ratio of a spike's height to the roughness around it. Not studied."""
-    noise: float = 0.01 * MILLIMETRE
-    """m: roughness of a noisy surface. Chosen: a tenth of the approach of a knee's contact."""
-    directions: int = 26
-    """Number of directions of the facets that marching cubes make of voxels."""
-    direction_share: float = 0.9
-    """1: smallest share of the area in that number of directions, on a surface of voxels. Chosen:
-    a smooth surface of an implant has less than half in so few."""
-    levels: int = 6
-    """Smallest number of equidistant levels of a surface of voxels. Chosen because a component
-    with flat cuts has fewer."""
-    least_cosine: float = 0.8
-    """1: smallest cosine between the normals of noisy neighbours and their mean; a smaller one is a
-    crease. Chosen: the edge of a component turns by more than twice this angle."""
-    least_eigenvalue: float = 1e-3
-    """1: smallest eigenvalue of the normal equations, at neighbours within the unit disc. With a
-    smaller one the quadric is not determined. Not studied."""
-    sheet: float = 0.3
-    """1: mean cosine between a surface beside a loop and the way to the loop's centre, above which
-    the surface lies within the loop. By definition 0 for a tube. Not studied otherwise."""
-    cap_spacing: float = 0.5 * MILLIMETRE
-    """m: spacing of the points that fill an opening. Chosen below the cells of a map."""
-
-
-DEFECT = DefectSettings()
+# Number of nearest vertices for a quadric: three times its six coefficients.
+NEIGHBOURS = 18
+# m: smallest height of a spike whose triangles have all their vertices among the nearest ones.
+# Chosen above the largest difference of 0.03 mm on the dishes of three inserts.
+SPIKE = 0.05 * MILLIMETRE
+# m: smallest height of another spike. Chosen above the largest difference of 0.12 mm on the dishes
+# of the same inserts; the nearest vertices then lie on one side.
+SPIKE_OF_FAN = 0.2 * MILLIMETRE
+# Smallest number of nearest vertices that share a triangle with a spike. By definition of a tip on
+# a surface.
+LEAST_RING = 3
+# 1: smallest ratio of a spike's height to the roughness around it. Not studied.
+SPIKE_RATIO = 6.0
+# m: roughness of a noisy surface. Chosen: a tenth of the approach of a knee's contact.
+NOISE = 0.01 * MILLIMETRE
+# Number of directions of the facets that marching cubes make of voxels.
+DIRECTIONS = 26
+# 1: smallest share of the area in that number of directions, on a surface of voxels. Chosen: a
+# smooth surface of an implant has less than half in so few.
+DIRECTION_SHARE = 0.9
+# Smallest number of equidistant levels of a surface of voxels. Chosen because a component with
+# flat cuts has fewer.
+LEVELS = 6
+# 1: smallest cosine between the normals of noisy neighbours and their mean; a smaller one is a
+# crease. Chosen: the edge of a component turns by more than twice this angle.
+LEAST_COSINE = 0.8
+# 1: smallest eigenvalue of the normal equations, at neighbours within the unit disc. With a
+# smaller one the quadric is not determined. Not studied.
+LEAST_EIGENVALUE = 1e-3
+# 1: mean cosine between a surface beside a loop and the way to the loop's centre, above which the
+# surface lies within the loop. By definition 0 for a tube. Not studied otherwise.
+SHEET = 0.3
+# m: spacing of the points that fill an opening. Chosen below the cells of a map.
+CAP_SPACING = 0.5 * MILLIMETRE
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,20 +104,20 @@ def defects_of(surface: "Surface") -> tuple[Defect, ...]:
     if steps is not None:
         return (*found, steps)
     vertices = np.unique(surface.corner_vertices)
-    if len(vertices) <= DEFECT.neighbours + 1:
+    if len(vertices) <= NEIGHBOURS + 1:
         return tuple(found)
     points = surface.vertices[vertices]
-    near: Index = cKDTree(points).query(points, DEFECT.neighbours + 1)[1][:, 1:]
+    near: Index = cKDTree(points).query(points, NEIGHBOURS + 1)[1][:, 1:]
     height, roughness = _heights(points, _normals(surface)[vertices], near)
-    calm = roughness < DEFECT.noise
-    spikes = calm & (np.abs(height) > np.maximum(DEFECT.spike, DEFECT.spike_ratio * roughness))
+    calm = roughness < NOISE
+    spikes = calm & (np.abs(height) > np.maximum(SPIKE, SPIKE_RATIO * roughness))
     for n in np.flatnonzero(spikes):
         # The tip of a fan of long triangles is no spike: its neighbours are on other surfaces.
         ring = surface.corner_vertices[(surface.corner_vertices == vertices[n]).any(axis=1)]
         others = np.setdiff1d(ring, vertices[n])
         count = np.isin(others, vertices[near[n]]).sum()
-        high = abs(height[n]) > DEFECT.spike_of_fan
-        if count < (DEFECT.least_ring if high else len(others)):
+        high = abs(height[n]) > SPIKE_OF_FAN
+        if count < (LEAST_RING if high else len(others)):
             continue
         words = f"a spike of {abs(height[n]) / MILLIMETRE:.2g} mm"
         found.append(Defect("spike", words, points[n : n + 1]))
@@ -149,7 +142,7 @@ def _opening(surface: "Surface", loop: BoundaryLoop) -> Defect:
     """
     ring = surface.vertices[loop.vertices]
     words = f"an opening {loop.width / MILLIMETRE:.2g} mm wide"
-    if _inward(surface, loop) > DEFECT.sheet:
+    if _inward(surface, loop) > SHEET:
         return Defect("opening", words, ring)
     normals = _normals(surface)[loop.vertices]
     axis = normals.sum(axis=0)
@@ -159,7 +152,7 @@ def _opening(surface: "Surface", loop: BoundaryLoop) -> Defect:
     steep = lean < 0.5
     sagitta = 0.0 if steep.all() else 0.5 * float(np.mean(height[~steep] / lean[~steep]))
     reach = float(np.linalg.norm(ring - loop.centre, axis=1).max())
-    count = int(np.clip(np.ceil(reach / DEFECT.cap_spacing), 1, 40)) + 1
+    count = int(np.clip(np.ceil(reach / CAP_SPACING), 1, 40)) + 1
     share = np.linspace(0.0, 1.0, count)[:, None, None]
     cap = loop.centre + share * (ring - loop.centre) + (1.0 - share**2) * sagitta * axis
     return Defect("opening", words, cap.reshape(-1, 3))
@@ -212,12 +205,12 @@ def _heights(points: Array, normals: Array, near: Index) -> tuple[Array, Array]:
     residual = np.sqrt((left**2).mean(axis=1)) * scale[:, 0]
     height = -fit[:, 0] * scale[:, 0]
     known = np.ones(len(points), bool)
-    odd = (np.abs(height) > DEFECT.spike) | (residual > DEFECT.noise)
-    known[odd] = np.linalg.eigvalsh(square[odd])[:, 0] > DEFECT.least_eigenvalue
+    odd = (np.abs(height) > SPIKE) | (residual > NOISE)
+    known[odd] = np.linalg.eigvalsh(square[odd])[:, 0] > LEAST_EIGENVALUE
     # A spike tilts the normals beside it, but its neighbours fit a quadric.
     facing = known & (cosine > 0.0).all(axis=1)
-    smooth = known & (cosine > DEFECT.least_cosine).all(axis=1)
-    calm = facing & (residual < DEFECT.noise)
+    smooth = known & (cosine > LEAST_COSINE).all(axis=1)
+    calm = facing & (residual < NOISE)
     return np.where(smooth | calm, height, 0.0), np.where(smooth, residual, 0.0)
 
 
@@ -227,15 +220,15 @@ def _steps(surface: "Surface") -> Defect | None:
     key = np.round(normals / 0.02).astype(np.int64) @ [1, 1000, 1000000]
     _, group = np.unique(key, return_inverse=True)
     area = np.bincount(group.reshape(-1), areas)
-    largest = np.argsort(-area)[: DEFECT.directions]
-    if area[largest].sum() < DEFECT.direction_share * areas.sum():
+    largest = np.argsort(-area)[:DIRECTIONS]
+    if area[largest].sum() < DIRECTION_SHARE * areas.sum():
         return None
     members = np.flatnonzero(group.reshape(-1) == largest[0])
     axis = normals[members].mean(axis=0)
     level = np.sort(surface.triangles[members].mean(axis=1) @ axis)
     gap = np.diff(level)
-    gap = gap[gap > DEFECT.noise]
-    if len(gap) < DEFECT.levels - 1 or not (np.abs(gap / np.median(gap) - 1.0) < 0.05).mean() > 0.7:
+    gap = gap[gap > NOISE]
+    if len(gap) < LEVELS - 1 or not (np.abs(gap / np.median(gap) - 1.0) < 0.05).mean() > 0.7:
         return None
     words = f"steps of {np.median(gap) / MILLIMETRE:.2g} mm"
     return Defect("steps", words, surface.vertices)

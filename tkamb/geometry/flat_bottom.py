@@ -12,44 +12,31 @@ from tkamb.geometry.frames import Array, Index, Mask, pose
 from tkamb.geometry.repair import facing_material
 from tkamb.geometry.surface import Surface
 
+# m: largest distance of a flat's corners from its plane. Chosen because the noise of a mesh is
+# smaller.
+FLATNESS = 5e-5
+# 1: smallest area of a flat that may be the bottom, as a share of the largest flat's area. Chosen
+# because a smaller flat is a recess.
+COMPARABLE_SHARE = 0.5
+# 1: of two flats that face down, the larger one is the bottom if the smaller one has less than
+# this share of the larger one's area. If the areas are closer, the mesh is refused.
+CLEAR_SHARE = 0.9
+# m: noise of the bottom above which a notice is printed. Chosen because a mesh in single precision
+# rounds by less.
+UNEVEN_NOISE = 1e-6
+# rad: a smaller tilt is not corrected. Chosen because it moves the ends of the insert by less than
+# rounding.
+LEVEL_TILT = 1e-6
 
-@dataclass(frozen=True)
-class FlatBottomSettings:
-    """Definition of the flat bottom of an insert."""
-
-    flatness: float = 5e-5
-    """m: largest distance of a flat's corners from its plane. Chosen because the noise of a mesh is
-    smaller."""
-    comparable_share: float = 0.5
-    """1: smallest area of a flat that may be the bottom, as a share of the largest flat's area.
-    Chosen because a smaller flat is a recess."""
-    clear_share: float = 0.9
-    """1: of two flats that face down, the larger one is the bottom if the smaller one has less than
-    this share of the larger one's area. If the areas are closer, the mesh is refused."""
-    uneven_noise: float = 1e-6
-    """m: noise of the bottom above which a notice is printed. Chosen because a mesh in single
-    precision rounds by less."""
-    level_tilt: float = 1e-6
-    """rad: a smaller tilt is not corrected. Chosen because it moves the ends of the insert by less
-    than rounding."""
-
-
-FLAT_BOTTOM = FlatBottomSettings()
 
 TILT_LIMIT = math.radians(30.0)
 """rad: a bottom tilted by less than this from -y is turned level."""
 
 
-@dataclass(frozen=True)
-class InnerFlatSettings:
-    """Flats inside a body."""
+# 1: a flat is an inner wall if material lies in front of more than this share of its area. Chosen:
+# the majority of the area.
+INNER_SHARE = 0.5
 
-    inner_share: float = 0.5
-    """1: a flat is an inner wall if material lies in front of more than this share of its area.
-    Chosen: the majority of the area."""
-
-
-INNER_FLAT = InnerFlatSettings()
 
 _CONE = math.radians(15.0)
 
@@ -89,7 +76,7 @@ def find_flats(surface: Surface) -> list[FlatBottom]:
     free = area > 0
     flats: list[FlatBottom] = []
     for _ in range(12):
-        least = FLAT_BOTTOM.comparable_share * max((f.area for f in flats), default=0.0)
+        least = COMPARABLE_SHARE * max((f.area for f in flats), default=0.0)
         flat = _largest_flat(surface, normals, area, free, least) if free.any() else None
         if flat is None or flat.area < least:
             break
@@ -97,7 +84,7 @@ def find_flats(surface: Surface) -> list[FlatBottom]:
         free = free.copy()
         free[flat.faces] = False
     largest = max((flat.area for flat in flats), default=0.0)
-    flats = [flat for flat in flats if flat.area >= FLAT_BOTTOM.comparable_share * largest]
+    flats = [flat for flat in flats if flat.area >= COMPARABLE_SHARE * largest]
     return sorted(flats, key=lambda flat: -flat.area)
 
 
@@ -127,20 +114,20 @@ def find_flat_bottom(surface: Surface, rotation: Array | None = None) -> FlatBot
         down = outer or down
     if not down:
         raise _faces_elsewhere(surface.name, flats[0], rotation)
-    if len(down) > 1 and down[1].area >= FLAT_BOTTOM.clear_share * down[0].area:
+    if len(down) > 1 and down[1].area >= CLEAR_SHARE * down[0].area:
         raise InputError(
             f"{surface.name} has two flats that could be its bottom: "
             f"{_described(down[0], rotation)}, and {_described(down[1], rotation)}",
             None,
             "remove one, or give the part without its underside",
         )
-    if down[0].noise > FLAT_BOTTOM.uneven_noise:
+    if down[0].noise > UNEVEN_NOISE:
         _log.warning(
             "%s: the flat bottom is uneven by %.0f µm (root mean square)",
             surface.name,
             1e6 * down[0].noise,
         )
-    if down[0].area < FLAT_BOTTOM.clear_share * flats[0].area:
+    if down[0].area < CLEAR_SHARE * flats[0].area:
         _log.warning(
             "%s: the flat that faces inferior (%s) is taken as the bottom, though another is "
             "larger (%s)",
@@ -154,7 +141,7 @@ def find_flat_bottom(surface: Surface, rotation: Array | None = None) -> FlatBot
 def _is_inner(surface: Surface, flat: FlatBottom) -> bool:
     """Return whether material lies in front of most of a flat."""
     area = surface.areas[flat.faces]
-    return bool(area @ facing_material(surface, flat.faces) > INNER_FLAT.inner_share * area.sum())
+    return bool(area @ facing_material(surface, flat.faces) > INNER_SHARE * area.sum())
 
 
 def _faces_elsewhere(name: str, flat: FlatBottom, rotation: Array) -> InputError:
@@ -215,7 +202,7 @@ def _levelling(normal: Array) -> Array:
     """Return the smallest rotation (3, 3) that turns the normal to -y."""
     axis = np.cross(normal, [0.0, -1.0, 0.0])
     sine = float(np.linalg.norm(axis))
-    if sine < FLAT_BOTTOM.level_tilt:
+    if sine < LEVEL_TILT:
         return np.eye(3)
     angle = math.atan2(sine, -normal[1])
     return Rotation.from_rotvec(axis / sine * angle).as_matrix()
@@ -259,12 +246,12 @@ def _grown(
 ) -> FlatBottom | None:
     corners, weight = surface.triangles[near], area[near]
     normal, cone = _sharpened(seed, normals[near], weight), _CONE
-    offset = _densest(corners.mean(axis=1) @ normal, weight, 20 * FLAT_BOTTOM.flatness)
+    offset = _densest(corners.mean(axis=1) @ normal, weight, 20 * FLATNESS)
     tolerances = (
-        20 * FLAT_BOTTOM.flatness,
-        8 * FLAT_BOTTOM.flatness,
-        3 * FLAT_BOTTOM.flatness,
-        FLAT_BOTTOM.flatness,
+        20 * FLATNESS,
+        8 * FLATNESS,
+        3 * FLATNESS,
+        FLATNESS,
         0.0,
         0.0,
     )
@@ -275,7 +262,7 @@ def _grown(
             lean = _median(
                 np.arccos(np.clip(normals[near] @ normal, -1, 1))[chosen], weight[chosen]
             )
-            tolerance = min(max(3 * spread, 1e-6), FLAT_BOTTOM.flatness)
+            tolerance = min(max(3 * spread, 1e-6), FLATNESS)
             cone = min(max(6 * lean, math.radians(0.5)), _CONE)
         distance = np.abs(corners @ normal - offset).max(axis=1)
         chosen = (distance <= tolerance) & (normals[near] @ normal > math.cos(cone))

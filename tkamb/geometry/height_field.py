@@ -24,31 +24,15 @@ from tkamb.geometry.surface import Surface
 from tkamb.geometry.topology import counted
 from tkamb.geometry.winding import PlanGrid
 
-
-@dataclass(frozen=True)
-class HeightFieldSettings:
-    """Pairing and repair of the crossings of lines with a surface."""
-
-    odd_share: float = 0.01
-    """1: largest share of lines with an odd number of crossings. These lines are repaired; with a
-    larger share the mesh is refused. Chosen because small defects of a mesh affect fewer lines."""
-    same_height: float = 1e-12
-    """m: crossings nearer to each other belong to duplicate faces. Chosen because it is above
-    rounding."""
+# 1: largest share of lines with an odd number of crossings. These lines are repaired; with a
+# larger share the mesh is refused. Chosen because small defects of a mesh affect fewer lines.
+ODD_SHARE = 0.01
+# m: crossings nearer to each other belong to duplicate faces. Chosen because it is above rounding.
+SAME_HEIGHT = 1e-12
 
 
-HEIGHT_FIELD = HeightFieldSettings()
-
-
-@dataclass(frozen=True)
-class BodyContactSettings:
-    """Contact of the bodies of one mesh."""
-
-    touching_distance: float = 1e-7
-    """m: distance below which bodies touch. Chosen: ten times the rounding of single precision."""
-
-
-BODY_CONTACT = BodyContactSettings()
+# m: distance below which bodies touch. Chosen: ten times the rounding of single precision.
+TOUCHING_DISTANCE = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,9 +210,7 @@ def _paired(line: Index, height: Array, rising: Mask, count: int) -> tuple[Index
     ends = np.flatnonzero((winding > 0) != (winding - step > 0))
     line, height = line[ends], height[ends]
     touching = np.zeros(len(ends), bool)
-    touching[1:-1:2] = (np.diff(line)[1::2] == 0) & (
-        np.diff(height)[1::2] <= BODY_CONTACT.touching_distance
-    )
+    touching[1:-1:2] = (np.diff(line)[1::2] == 0) & (np.diff(height)[1::2] <= TOUCHING_DISTANCE)
     touching[2::2] = touching[1:-1:2]
     lines = np.concatenate([lines, line[~touching]])
     heights = np.concatenate([heights, height[~touching]])
@@ -241,11 +223,7 @@ def _distinct(line: Index, height: Array, rising: Mask) -> tuple[Index, Array]:
     order = np.lexsort((height, rising, line))
     line, height, rising = line[order], height[order], rising[order]
     keep = np.ones(len(line), bool)
-    keep[1:] = (
-        (np.diff(line) > 0)
-        | (np.diff(height) > HEIGHT_FIELD.same_height)
-        | (rising[1:] != rising[:-1])
-    )
+    keep[1:] = (np.diff(line) > 0) | (np.diff(height) > SAME_HEIGHT) | (rising[1:] != rising[:-1])
     line, height = line[keep], height[keep]
     order = np.lexsort((height, line))
     return line[order], height[order]
@@ -258,7 +236,7 @@ def _repaired(
     if not odd.any():
         return line, height
     crossed = np.count_nonzero(np.bincount(line, minlength=odd.size))
-    if odd.sum() > max(HEIGHT_FIELD.odd_share * crossed, 1):
+    if odd.sum() > max(ODD_SHARE * crossed, 1):
         raise InputError(
             f"{odd.sum()} of {crossed} rays cross the surface an odd number of times: it is open",
             name,

@@ -22,18 +22,11 @@ if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
 
 
-@dataclass(frozen=True)
-class BoxTreeSettings:
-    """The tree of boxes around a surface's triangles."""
-
-    triangles_per_leaf: int = 4
-    """Largest number of triangles in a leaf. Chosen for speed; results do not depend on it."""
-    margin: float = 1e-7
-    """1: distance by which boxes are enlarged, as a share of the surface's size. Chosen because it
-    is above rounding."""
-
-
-BOX_TREE = BoxTreeSettings()
+# Largest number of triangles in a leaf. Chosen for speed; results do not depend on it.
+TRIANGLES_PER_LEAF = 4
+# 1: distance by which boxes are enlarged, as a share of the surface's size. Chosen because it is
+# above rounding.
+MARGIN = 1e-7
 
 
 def rows(vectors: ArrayLike) -> Array:
@@ -65,7 +58,7 @@ class TriangleTree:
         with_area = chosen[surface.areas[chosen] > 0.0]
         chosen = with_area if len(with_area) else chosen
         leaves = chosen[_halved(0.5 * (low + high)[chosen])]
-        margin = BOX_TREE.margin * float(np.linalg.norm(np.ptp(surface.bounds, axis=0)))
+        margin = MARGIN * float(np.linalg.norm(np.ptp(surface.bounds, axis=0)))
         count = len(leaves)
         self.faces = leaves.ravel()
         self.boxes = np.zeros((2 * count, 6))
@@ -106,7 +99,7 @@ class TriangleTree:
 def _halved(centres: Array) -> Index:
     """Return the triangles (p, c) of the p leaves; some appear twice, to fill the rows."""
     leaves = 1
-    while leaves * BOX_TREE.triangles_per_leaf < len(centres):
+    while leaves * TRIANGLES_PER_LEAF < len(centres):
         leaves *= 2
     room = leaves * -(-len(centres) // leaves)
     order = np.arange(room) * len(centres) // room  # order of the input, which is often sorted
@@ -169,15 +162,9 @@ def _part(centres: Array, order: Index, axis: int, first: int, last: int, middle
             return
 
 
-@dataclass(frozen=True)
-class NearestSettings:
-    """Samples that cover a surface."""
+# Largest number of samples of a surface. Chosen because it limits memory and time.
+MAX_SAMPLES = 150_000
 
-    max_samples: int = 150_000
-    """Largest number of samples of a surface. Chosen because it limits memory and time."""
-
-
-NEAREST = NearestSettings()
 
 FLAT = 1e-14
 """1: a triangle counts as a line if 4 area² / (edge² edge²) is smaller."""
@@ -255,12 +242,12 @@ def sampled(surface: "Surface", spacing: float) -> tuple[Array, Index, Array]:
 
     A triangle is divided into similar triangles with edges of at most `spacing` (m). The samples
     are their centres. The spacing is increased if the surface needs more than
-    `NEAREST.max_samples` samples.
+    `MAX_SAMPLES` samples.
     """
     triangles = surface.triangles
     longest = surface.longest_edges
     cuts = np.maximum(np.ceil(longest / spacing).astype(int), 1)
-    while (cuts**2).sum() > max(NEAREST.max_samples, len(triangles)) and cuts.max() > 1:
+    while (cuts**2).sum() > max(MAX_SAMPLES, len(triangles)) and cuts.max() > 1:
         spacing *= 1.2
         cuts = np.maximum(np.ceil(longest / spacing).astype(int), 1)
     area = surface.areas / cuts**2

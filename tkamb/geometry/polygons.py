@@ -4,7 +4,6 @@ A sagittal section is the intersection of a surface with a plane z = const of it
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -110,19 +109,12 @@ def _points_below(segments: Array, y: float) -> Array:
     return np.concatenate([ends[ends[:, 1] <= y], crossings])
 
 
-@dataclass(frozen=True)
-class PolygonSettings:
-    """Division of polygons into triangles."""
-
-    area_rounding: float = 1e-12
-    """1: a signed area below this share of the polygon's area is zero. Chosen because it is above
-    rounding."""
-    least_area_share: float = 1e-9
-    """1: smallest ratio of a polygon's enclosed area to the total area of its triangles. With a
-    smaller ratio the polygon crosses itself. Chosen because it is above rounding."""
-
-
-POLYGON = PolygonSettings()
+# 1: a signed area below this share of the polygon's area is zero. Chosen because it is above
+# rounding.
+AREA_ROUNDING = 1e-12
+# 1: smallest ratio of a polygon's enclosed area to the total area of its triangles. With a smaller
+# ratio the polygon crosses itself. Chosen because it is above rounding.
+LEAST_AREA_SHARE = 1e-9
 
 
 class CrossedPolygonError(ValueError):
@@ -156,13 +148,12 @@ def triangulated(vertices: Array, corners: Index, ends: Index) -> Index:
     total = np.stack([np.bincount(polygon, part, len(ends)) for part in cross.T], axis=1)
     along = np.einsum("ij,ij->i", cross, total[polygon])
     size = np.einsum("ij,ij->i", total, total)
-    concave = np.unique(polygon[along < -POLYGON.area_rounding * size[polygon]])
+    concave = np.unique(polygon[along < -AREA_ROUNDING * size[polygon]])
     longest = np.zeros(len(ends))
     np.maximum.at(longest, polygon, np.einsum("ij,ij->i", c - a, c - a))
     covered = np.bincount(polygon, np.linalg.norm(cross, axis=1), len(ends))
     if (
-        (np.sqrt(size) < POLYGON.least_area_share * covered)
-        & (covered > POLYGON.least_area_share * longest)
+        (np.sqrt(size) < LEAST_AREA_SHARE * covered) & (covered > LEAST_AREA_SHARE * longest)
     ).any():
         raise CrossedPolygonError("a polygon crosses itself")
     if not len(concave):
@@ -182,7 +173,7 @@ def ears(vertices: Array, ring: Index, normal: Array) -> Index:
     axis = int(np.argmax(np.abs(normal)))
     plane = [(axis + 1) % 3, (axis + 2) % 3]
     points = vertices[ring][:, plane if normal[axis] > 0 else plane[::-1]]
-    least = POLYGON.area_rounding * abs(float(normal[axis]))
+    least = AREA_ROUNDING * abs(float(normal[axis]))
     remaining, triangles = list(range(len(ring))), []
     at = tried = 0
     flat_ears = False

@@ -19,51 +19,36 @@ from tkamb.geometry.surface import Surface
 from tkamb.geometry.topology import connected_parts
 from tkamb.units import MILLIMETRE
 
-
-@dataclass(frozen=True)
-class CutSettings:
-    """Distance of a cutting plane from the vertices of a mesh."""
-
-    vertex_clearance: float = 1e-9
-    """m: smallest distance of the plane from a vertex. Chosen because it is above rounding."""
-    plane_shift: float = 1e-7
-    """m: step by which the plane is moved until its distance from all vertices is at least
-    `vertex_clearance`. Chosen because it changes no result."""
+# m: smallest distance of the plane from a vertex. Chosen because it is above rounding.
+VERTEX_CLEARANCE = 1e-9
+# m: step by which the plane is moved until its distance from all vertices is at least
+# `VERTEX_CLEARANCE`. Chosen because it changes no result.
+PLANE_SHIFT = 1e-7
 
 
-CUT = CutSettings()
+# m: spacing of the lines along y that measure the insert's height. Chosen because a post is
+# several times as wide.
+LINE_SPACING = 1e-3
+# m: smallest rise of a post above the lowest dish. Chosen because flanks and lips of dishes are
+# lower.
+LEAST_RISE = 8e-3
+# m: smallest drop of a steep side of a post within two lines. Chosen because this slope of 56 deg
+# is steeper than a dish.
+SIDE_DROP = 3e-3
+# 1: smallest share of a post's outline with a drop of `SIDE_DROP`. Chosen because a post may merge
+# into the insert along the rest.
+STEEP_SHARE = 0.75
+# 1: largest distance of a post's centre from the middle, as a share of half the insert's width.
+# Chosen because dishes lie farther out.
+MIDDLE_SHARE = 0.25
+# m: height above the surroundings at which the post is cut off. Chosen because it is above the
+# noise of a mesh.
+FOOT_CLEARANCE = 0.25e-3
+# 1: height above the foot at which the post's front is measured, as a share of its height.
+BACK_SHARE = 0.75
+# m: smallest thickness of a post. Chosen because a thinner post cannot carry the force of a cam.
+LEAST_THICKNESS = 2e-3
 
-
-@dataclass(frozen=True)
-class PostSettings:
-    """Definition of the post of an insert, and of the plane that cuts it off."""
-
-    line_spacing: float = 1e-3
-    """m: spacing of the lines along y that measure the insert's height. Chosen because a post is
-    several times as wide."""
-    least_rise: float = 8e-3
-    """m: smallest rise of a post above the lowest dish. Chosen because flanks and lips of dishes
-    are lower."""
-    side_drop: float = 3e-3
-    """m: smallest drop of a steep side of a post within two lines. Chosen because this slope of
-    56 deg is steeper than a dish."""
-    steep_share: float = 0.75
-    """1: smallest share of a post's outline with a drop of `side_drop`. Chosen because a post may
-    merge into the insert along the rest."""
-    middle_share: float = 0.25
-    """1: largest distance of a post's centre from the middle, as a share of half the insert's
-    width. Chosen because dishes lie farther out."""
-    foot_clearance: float = 0.25e-3
-    """m: height above the surroundings at which the post is cut off. Chosen because it is above the
-    noise of a mesh."""
-    back_share: float = 0.75
-    """1: height above the foot at which the post's front is measured, as a share of its height."""
-    least_thickness: float = 2e-3
-    """m: smallest thickness of a post. Chosen because a thinner post cannot carry the force of a
-    cam."""
-
-
-POST = PostSettings()
 
 FOOT_RING = (3, 5)
 """Inner and outer distance, in lines, of a ring around the post. The height of the surroundings is
@@ -109,32 +94,30 @@ def find_post(insert: Surface) -> Post | None:
     the middle of the width and is steep along 3/4 of its outline.
     """
     low, high = insert.bounds
-    x, z = (np.arange(low[a] + POST.line_spacing / 2, high[a], POST.line_spacing) for a in (0, 2))
+    x, z = (np.arange(low[a] + LINE_SPACING / 2, high[a], LINE_SPACING) for a in (0, 2))
     intervals = inside_intervals(insert, 1, z, x)
     top = np.full((len(x), len(z)), -np.inf)
     np.maximum.at(top, (intervals.second, intervals.first), intervals.upper)
     dish = float(np.percentile(top[np.isfinite(top)], 2.0))
-    patches, count = label(top > dish + POST.least_rise)
+    patches, count = label(top > dish + LEAST_RISE)
     for number in range(1, count + 1):
         patch = patches == number
         i, k = np.nonzero(patch)
-        centred = (
-            abs(z[k].mean() - (low[2] + high[2]) / 2) < POST.middle_share * (high[2] - low[2]) / 2
-        )
-        if centred and patch.sum() >= 9 and _steep_share(top, patch) >= POST.steep_share:
+        centred = abs(z[k].mean() - (low[2] + high[2]) / 2) < MIDDLE_SHARE * (high[2] - low[2]) / 2
+        if centred and patch.sum() >= 9 and _steep_share(top, patch) >= STEEP_SHARE:
             tip = float(top[patch].max())
-            foot = _ground(top, patch, dish) + POST.foot_clearance
+            foot = _ground(top, patch, dish) + FOOT_CLEARANCE
             if tip <= foot:  # the surroundings are higher
                 continue
-            upper_part = patch & (top > foot + POST.back_share * (tip - foot))
+            upper_part = patch & (top > foot + BACK_SHARE * (tip - foot))
             return Post(
                 x=float(x[i].mean()),
                 z=float(z[k].mean()),
                 height=tip - dish,
-                area=len(i) * POST.line_spacing**2,
+                area=len(i) * LINE_SPACING**2,
                 foot=foot,
                 front=float(x[np.nonzero(upper_part)[0]].max()),
-                half_width=float(np.ptp(z[k]) / 2 + POST.line_spacing / 2),
+                half_width=float(np.ptp(z[k]) / 2 + LINE_SPACING / 2),
             )
     return None
 
@@ -163,7 +146,7 @@ def divide_insert(insert: Surface) -> tuple[Surface, Surface]:
     vertices, behind, _ = split_faces(
         *closed_by_fans(vertices, above[in_post], "post"), 0, post.front
     )
-    if not len(behind) or np.ptp(vertices[behind][:, :, 0]) < POST.least_thickness:
+    if not len(behind) or np.ptp(vertices[behind][:, :, 0]) < LEAST_THICKNESS:
         raise InputError("the post has no depth that could carry a cam", where, "leave it out")
     return Surface(*dishes, insert.name), Surface(*closed_by_fans(vertices, behind, "post"), "post")
 
@@ -180,7 +163,7 @@ def _steep_share(top: Array, patch: Mask) -> float:
     near = binary_dilation(patch)
     around = binary_dilation(near, iterations=1) & ~near
     edge = float(np.median(top[patch & ~_eroded(patch)]))
-    return float(np.mean(top[around] < edge - POST.side_drop)) if around.any() else 0.0
+    return float(np.mean(top[around] < edge - SIDE_DROP)) if around.any() else 0.0
 
 
 def _eroded(patch: Mask) -> Mask:
@@ -202,8 +185,8 @@ def split_faces(
         level: m, coordinate of the plane, which is moved off the vertices (`CUT`).
     """
     height = vertices[:, axis] - level
-    while (np.abs(height) < CUT.vertex_clearance).any():
-        height -= CUT.plane_shift
+    while (np.abs(height) < VERTEX_CLEARANCE).any():
+        height -= PLANE_SHIFT
     above = height[faces] > 0
     count = above.sum(axis=1)
     crossed = np.flatnonzero((count == 1) | (count == 2))

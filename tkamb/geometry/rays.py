@@ -1,6 +1,5 @@
 """Crossings of rays with a triangulated surface, in double precision."""
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,25 +15,19 @@ if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
 
 
-@dataclass(frozen=True)
-class RaySettings:
-    """Tolerances of the ray caster."""
+# 1: largest distance of a crossing outside a triangle, in barycentric coordinates. Chosen because
+# it is above rounding.
+EDGE_TOLERANCE = 1e-9
+# 1: distance below which two crossings of a ray are one crossing, as a share of half the diagonal
+# of the bounding box. Chosen because it is above rounding.
+SAME_CROSSING = 1e-10
+# Number of crossings per ray for which memory is allocated at first. Chosen because most rays have
+# fewer.
+USUAL_CROSSINGS = 4
+# Number of rays from which two threads share the work. Chosen because with fewer rays the second
+# thread costs more time than it saves.
+THREADED_RAYS = 500
 
-    edge_tolerance: float = 1e-9
-    """1: largest distance of a crossing outside a triangle, in barycentric coordinates. Chosen
-    because it is above rounding."""
-    same_crossing: float = 1e-10
-    """1: distance below which two crossings of a ray are one crossing, as a share of half the
-    diagonal of the bounding box. Chosen because it is above rounding."""
-    usual_crossings: int = 4
-    """Number of crossings per ray for which memory is allocated at first. Chosen because most rays
-    have fewer."""
-    threaded_rays: int = 500
-    """Number of rays from which two threads share the work. Chosen because with fewer rays the
-    second thread costs more time than it saves."""
-
-
-RAY = RaySettings()
 
 STILL = 1e-200
 """1: smallest component of a direction that is inverted, so that the inverse stays finite."""
@@ -45,16 +38,8 @@ DEEPEST = 64
 NO_TRIANGLE = -1
 
 
-@dataclass(frozen=True)
-class RayGapSettings:
-    """Gaps between shells along a ray."""
-
-    touching_distance: float = 1e-6
-    """m: distance below which two shells touch. Chosen because it is above the rounding of a
-    mesh."""
-
-
-RAY_GAP = RayGapSettings()
+# m: distance below which two shells touch. Chosen because it is above the rounding of a mesh.
+TOUCHING_DISTANCE = 1e-6
 
 
 class RayCaster:
@@ -73,7 +58,7 @@ class RayCaster:
         self.surface = surface
         tree = TriangleTree(surface) if tree is None else tree
         lower, upper = surface.bounds
-        self._same = RAY.same_crossing * float(np.linalg.norm(upper - lower)) / 2.0
+        self._same = SAME_CROSSING * float(np.linalg.norm(upper - lower)) / 2.0
         rows = surface.barycentric_rows.reshape(-1, 6)
         planes = np.hstack([surface.triangles[:, 0], surface.face_normals, rows])
         self._tree = tree.boxes, tree.faces, planes[tree.faces]
@@ -118,16 +103,14 @@ class RayCaster:
                 last[number] = distances[k]
                 entries = np.flatnonzero(
                     ~exits
-                    & (distances >= distances[k] - RAY_GAP.touching_distance)
+                    & (distances >= distances[k] - TOUCHING_DISTANCE)
                     & (np.arange(len(distances)) != k)
                 )
-                later_entries = entries[
-                    distances[entries] > distances[0] + RAY_GAP.touching_distance
-                ]
+                later_entries = entries[distances[entries] > distances[0] + TOUCHING_DISTANCE]
                 if not len(later_entries):
                     break
                 next_entry = later_entries[0]
-                touching = distances[next_entry] - distances[k] <= RAY_GAP.touching_distance
+                touching = distances[next_entry] - distances[k] <= TOUCHING_DISTANCE
                 void = shells[k] == shells[next_entry] != shells[0]
                 if not (touching or void):
                     break
@@ -149,11 +132,9 @@ class RayCaster:
 
         def crossings(part: slice) -> tuple[Array, Index, Array]:
             along = directions[part] if len(directions) > 1 else directions
-            return _first_crossings(
-                *self._tree, origins[part], along, -self._same, RAY.edge_tolerance
-            )
+            return _first_crossings(*self._tree, origins[part], along, -self._same, EDGE_TOLERANCE)
 
-        if len(origins) < RAY.threaded_rays:
+        if len(origins) < THREADED_RAYS:
             return crossings(slice(0, len(origins)))
         first_half, second_half = in_halves(crossings, len(origins))
         distance, face, weights = (
@@ -174,12 +155,12 @@ class RayCaster:
             ray (m,), distance (m,), m, and face (m,), sorted by ray, then by distance.
         """
         rays = _rays(origins, directions)
-        number, capacity = RAY.usual_crossings * len(rays[0]), -1
+        number, capacity = USUAL_CROSSINGS * len(rays[0]), -1
         while number > capacity:
             capacity = number
             ray, distance, face = (np.empty(capacity, kind) for kind in (np.int64, float, np.int64))
             number = _all_crossings(
-                *self._tree, *rays, -self._same, RAY.edge_tolerance, ray, distance, face
+                *self._tree, *rays, -self._same, EDGE_TOLERANCE, ray, distance, face
             )
         return self._merged(ray[:number], distance[:number], face[:number], rays[1])
 

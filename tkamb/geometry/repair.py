@@ -31,23 +31,14 @@ from tkamb.geometry.topology import (
     signed_volumes,
 )
 
-
-@dataclass(frozen=True)
-class RepairSettings:
-    """Repair of openings when a mesh is read."""
-
-    weld_distance: float = 5e-5
-    """m: distance below which vertices of open edges are merged. Chosen below the facets of a mesh
-    and above the rounding of its file."""
-    gap_width: float = 2e-3
-    """m: largest width of a hole that is closed by a fan of triangles. Chosen: about one lattice
-    cell."""
-    triangle_width: float = 5e-3
-    """m: largest width of a hole of three edges that is closed. It may be wider than other holes,
-    because it is one missing triangle."""
-
-
-REPAIR = RepairSettings()
+# m: distance below which vertices of open edges are merged. Chosen below the facets of a mesh and
+# above the rounding of its file.
+WELD_DISTANCE = 5e-5
+# m: largest width of a hole that is closed by a fan of triangles. Chosen: about one lattice cell.
+GAP_WIDTH = 2e-3
+# m: largest width of a hole of three edges that is closed. It may be wider than other holes,
+# because it is one missing triangle.
+TRIANGLE_WIDTH = 5e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +191,7 @@ def _wound(vertices: Array, faces: Index) -> tuple[Index, int, bool]:
 
 
 def _welded(vertices: Array, faces: Index) -> tuple[Index, int]:
-    """Merge vertices of open edges within `REPAIR.weld_distance` of each other.
+    """Merge vertices of open edges within `WELD_DISTANCE` of each other.
 
     Returns:
         The faces, and the number of merged vertices.
@@ -208,7 +199,7 @@ def _welded(vertices: Array, faces: Index) -> tuple[Index, int]:
     loose = np.unique(open_edges(faces))
     if len(loose) == 0:
         return faces, 0
-    pairs = cKDTree(vertices[loose]).query_pairs(REPAIR.weld_distance, output_type="ndarray")
+    pairs = cKDTree(vertices[loose]).query_pairs(WELD_DISTANCE, output_type="ndarray")
     if len(pairs) == 0:
         return faces, 0
     graph = coo_matrix((np.ones(len(pairs), bool), pairs.T), shape=(len(loose), len(loose)))
@@ -229,9 +220,7 @@ def _filled(vertices: Array, faces: Index) -> tuple[Array, Index, int, float]:
     widest, total, filled = 0.0, len(vertices), 0
     for loop in boundary_loops(vertices, faces):
         ring = loop.vertices[::-1]
-        if len(ring) < 3 or loop.width > (
-            REPAIR.triangle_width if len(ring) == 3 else REPAIR.gap_width
-        ):
+        if len(ring) < 3 or loop.width > (TRIANGLE_WIDTH if len(ring) == 3 else GAP_WIDTH):
             continue
         if len(ring) == 3:
             new_faces.append(ring[None])
@@ -292,21 +281,15 @@ def _forks(faces: Index) -> Index:
     return np.unique(half_edges(faces)[odd[edge]])
 
 
-@dataclass(frozen=True)
-class InnerWallSettings:
-    """Walls inside a surface."""
+# m: distance in front of a triangle at which material is searched. Chosen because bodies with a
+# wider gap are separate.
+PROBE_DISTANCE = 2e-5
+# m: distance below which a vertex lies on an open edge. Chosen because it is above the rounding of
+# a mesh.
+EDGE_DISTANCE = 1e-6
+# m²: smallest area of a wall. Chosen because triangles in a narrow corner have less area.
+LEAST_AREA = 2e-6
 
-    probe_distance: float = 2e-5
-    """m: distance in front of a triangle at which material is searched. Chosen because bodies with
-    a wider gap are separate."""
-    edge_distance: float = 1e-6
-    """m: distance below which a vertex lies on an open edge. Chosen because it is above the
-    rounding of a mesh."""
-    least_area: float = 2e-6
-    """m²: smallest area of a wall. Chosen because triangles in a narrow corner have less area."""
-
-
-INNER_WALL = InnerWallSettings()
 
 SAMPLES = np.array(
     [[1 / 3, 1 / 3, 1 / 3], [0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8], [0.45, 0.45, 0.1],
@@ -335,7 +318,7 @@ class InnerWall:
 def facing_material(surface: Surface, faces: Index) -> Mask:
     """Return whether each triangle (m,) of a closed surface has material on its outer side."""
     points = np.einsum("sc,kcx->ksx", SAMPLES, surface.triangles[faces])
-    points += INNER_WALL.probe_distance * surface.face_normals[faces][:, None]
+    points += PROBE_DISTANCE * surface.face_normals[faces][:, None]
     within = surface.winding.inside(points.reshape(-1, 3)).reshape(len(faces), -1)
     return np.asarray(within.all(axis=1))
 
@@ -357,7 +340,7 @@ def find_inner_wall(vertices: Array, faces: Index) -> InnerWall | None:
         return None
     inner = np.flatnonzero(inner_faces)
     area = surface.areas[inner]
-    if area.sum() / 2.0 < INNER_WALL.least_area:
+    if area.sum() / 2.0 < LEAST_AREA:
         return None
     centre = area @ surface.triangles[inner].mean(axis=1) / area.sum()
     remaining = _joined_along_rims(vertices, np.delete(faces, inner, axis=0))
@@ -384,9 +367,7 @@ def touching_groups(vertices: Array, bodies: list[Index], faces: Index, wall: In
         if not len(part):
             continue
         wall_part = Surface(vertices, faces[part], merged=True)
-        points = (
-            wall_part.triangles.mean(axis=1) + INNER_WALL.probe_distance * wall_part.face_normals
-        )
+        points = wall_part.triangles.mean(axis=1) + PROBE_DISTANCE * wall_part.face_normals
         for b in range(len(bodies)):
             if group[a] != group[b] and skins[b].winding.inside(points).any():
                 group = [group[a] if each == group[b] else each for each in group]
@@ -405,14 +386,14 @@ def _joined_along_rims(vertices: Array, faces: Index) -> Index:
         along = vertices[end] - vertices[start]
         length = float(np.linalg.norm(along))
         middle = (vertices[start] + vertices[end]) / 2.0
-        near = loose[tree.query_ball_point(middle, length / 2.0 + INNER_WALL.edge_distance)]
+        near = loose[tree.query_ball_point(middle, length / 2.0 + EDGE_DISTANCE)]
         near = near[(near != start) & (near != end)]
         share = (vertices[near] - vertices[start]) @ along / length**2
         distance = np.linalg.norm(vertices[near] - vertices[start] - share[:, None] * along, axis=1)
         dividing_vertices = (
-            (distance < INNER_WALL.edge_distance)
-            & (share * length > INNER_WALL.edge_distance)
-            & ((1 - share) * length > INNER_WALL.edge_distance)
+            (distance < EDGE_DISTANCE)
+            & (share * length > EDGE_DISTANCE)
+            & ((1 - share) * length > EDGE_DISTANCE)
         )
         if dividing_vertices.any():
             dividing[int(start), int(end)] = near[dividing_vertices][

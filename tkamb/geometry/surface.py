@@ -25,15 +25,8 @@ NO_CREASE = float(np.pi)
 """rad: crease angle with which all triangles at a vertex count."""
 
 
-@dataclass(frozen=True)
-class NormalSettings:
-    """Normals of a mesh."""
-
-    cosine_rounding: float = 1e-9
-    """1: difference below which two cosines are equal. Chosen because it is above rounding."""
-
-
-NORMAL = NormalSettings()
+# 1: difference below which two cosines are equal. Chosen because it is above rounding.
+COSINE_ROUNDING = 1e-9
 
 
 SMOOTH_WITHIN = np.radians(30.0)
@@ -339,7 +332,7 @@ def corner_normals(surface: Surface, crease: float, weights: Array) -> Array:
         # the crease angle of each other. Only other vertices need a comparison in pairs.
         lean = np.einsum("cj,cj->c", normals, _unit(mean)[vertex])
         rough = np.zeros(len(mean), bool)
-        rough[vertex[~(lean > np.cos(crease / 2) + NORMAL.cosine_rounding)]] = True
+        rough[vertex[~(lean > np.cos(crease / 2) + COSINE_ROUNDING)]] = True
         corners = np.flatnonzero(rough[vertex])
         corner_of_pair, neighbour = surface.corners_at_vertices.of(vertex[corners])
         turn = np.einsum("pj,pj->p", normals[corners[corner_of_pair]], normals[neighbour])

@@ -34,19 +34,12 @@ if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
 
 
-@dataclass(frozen=True)
-class WindingSettings:
-    """The plan view in which winding numbers are computed."""
-
-    max_buckets: int = 1_000_000
-    """Largest number of buckets of the plan view. Larger: more memory. Chosen because a larger
-    number saves no time."""
-    plan_bits: int = 29
-    """Number of bits of the largest integer position. Chosen because products of differences fit
-    into 63 bits."""
-
-
-WINDING = WindingSettings()
+# Largest number of buckets of the plan view. Larger: more memory. Chosen because a larger number
+# saves no time.
+MAX_BUCKETS = 1_000_000
+# Number of bits of the largest integer position. Chosen because products of differences fit into
+# 63 bits.
+PLAN_BITS = 29
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +59,7 @@ class PlanGrid:
         """Return the grid over the positions (n, 2) of vertices."""
         low, high = plan.min(axis=0), plan.max(axis=0)
         half = float((high - low).max()) / 2.0
-        return cls((low + high) / 2.0, (2**WINDING.plan_bits - 1) / max(half, 1e-30))
+        return cls((low + high) / 2.0, (2**PLAN_BITS - 1) / max(half, 1e-30))
 
     @property
     def step(self) -> float:
@@ -76,9 +69,7 @@ class PlanGrid:
     def whole(self, plan: Array) -> Index:
         """Return positions (n, 2), m, as integers; positions far from the surface are clipped."""
         numbers = np.rint((plan - self.middle) * self.scale)
-        return np.clip(
-            numbers, -(2 ** (WINDING.plan_bits + 1)), 2 ** (WINDING.plan_bits + 1)
-        ).astype(np.int64)
+        return np.clip(numbers, -(2 ** (PLAN_BITS + 1)), 2 ** (PLAN_BITS + 1)).astype(np.int64)
 
 
 class WindingNumber:
@@ -102,7 +93,7 @@ class WindingNumber:
     def _buckets(self) -> tuple[Index, Index, Index, Index, Index]:
         """Lower corner (2,), edge (2,) and number (2,) of the buckets, and their triangles."""
         low = self._plan.min(axis=0)
-        per_side = int(np.ceil(np.sqrt(min(max(len(self._faces), 1), WINDING.max_buckets))))
+        per_side = int(np.ceil(np.sqrt(min(max(len(self._faces), 1), MAX_BUCKETS))))
         count = np.array([per_side, per_side], np.int64)
         edge = (self._plan.max(axis=0) - low) // count + 1
         corners = self._plan[self._faces]

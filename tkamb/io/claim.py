@@ -18,8 +18,8 @@ from filelock import FileLock, Timeout
 
 from tkamb.errors import InputError
 from tkamb.files import (
-    FILE_LIMITS,
     MARKER,
+    TABLE_BYTES,
     TEMPORARY,
     claim_directory,
     finish_replacement,
@@ -88,7 +88,7 @@ def _rows_of(folder: Path) -> tuple[str, str]:
     """Return the command of a folder's unfinished study ("" without one), and the study's file."""
     name = "rows.jsonl"
     try:
-        first = read_text(folder / name, FILE_LIMITS.table_bytes).partition("\n")[0]
+        first = read_text(folder / name, TABLE_BYTES).partition("\n")[0]
     except InputError:
         return "", name
     if not first.startswith('{"key": '):

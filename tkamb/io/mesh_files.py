@@ -9,7 +9,7 @@ import trimesh
 
 from tkamb.contact.lattice.meshing.grid import Lattice
 from tkamb.contact.lattice.meshing.quality import LatticeQuality, measure_quality, whole_lattice
-from tkamb.contact.registry import MAP_GRID
+from tkamb.contact.registry import COARSEST
 from tkamb.errors import InputError
 from tkamb.files import replaced_file
 from tkamb.geometry.flat_bottom import insert_placement
@@ -78,8 +78,8 @@ def lattice_of_file(
     """
     if out is not None and Path(out).suffix != ".vtu":
         raise InputError(f"'{out}' is not a .vtu file", "out", "give a name like lattice.vtu")
-    if not 0 < resolution_mm * MILLIMETRE <= MAP_GRID.coarsest:
-        hint = f"give more than 0, at most {MAP_GRID.coarsest / MILLIMETRE:g} mm"
+    if not 0 < resolution_mm * MILLIMETRE <= COARSEST:
+        hint = f"give more than 0, at most {COARSEST / MILLIMETRE:g} mm"
         raise InputError(f"resolution {resolution_mm} mm", "mesh lattice", hint)
     surface = load_surface(insert, units, axes, name="insert", closed=True)
     if side == "left":

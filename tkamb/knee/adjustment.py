@@ -40,16 +40,9 @@ if TYPE_CHECKING:
     from tkamb.contact.model import Probe
 
 
-@dataclass(frozen=True)
-class SplitSensitivitySettings:
-    """The finite difference of the medial force with respect to adduction."""
-
-    adduction_step: float = 0.02 * DEGREE
-    """rad: step of the finite difference. Chosen because it shifts about 60 N between the condyles,
-    thirty times the lattice's tolerance, but unloads no condyle (0.2 deg or more would)."""
-
-
-SPLIT_SENSITIVITY = SplitSensitivitySettings()
+# rad: step of the finite difference. Chosen because it shifts about 60 N between the condyles,
+# thirty times the lattice's tolerance, but unloads no condyle (0.2 deg or more would).
+ADDUCTION_STEP = 0.02 * DEGREE
 
 
 ADDUCTION, SUPERIOR = (KNEE_COORDINATES.index(name) for name in ("adduction", "si"))
@@ -72,12 +65,12 @@ def split_sensitivity(
     """
     load = -float(result.wrench_on_insert[1])
     coordinates = knee_coordinates(result.pose)
-    coordinates[ADDUCTION] += SPLIT_SENSITIVITY.adduction_step
+    coordinates[ADDUCTION] += ADDUCTION_STEP
     warm_start = WarmStart.after(result) if start is None else start
     rotated, _ = probe.pressed(load, knee_pose(coordinates), warm_start)
     if rotated.status is not ContactStatus.OK:
         return float("nan")
-    return (_medial(rotated) - _medial(result)) / SPLIT_SENSITIVITY.adduction_step
+    return (_medial(rotated) - _medial(result)) / ADDUCTION_STEP
 
 
 def split_tangent(probe: "Probe", result: ContactResult) -> float:
@@ -112,16 +105,9 @@ def _medial(result: ContactResult) -> float:
     return result.medial.force if result.medial else 0.0
 
 
-@dataclass(frozen=True)
-class AdjustmentEffectSettings:
-    """Limit for the words that describe the effect of an adjustment."""
-
-    jump_distance: float = 5.0 * MILLIMETRE
-    """m: displacement of a contact point above which the text says "jumps" and not "moves". Chosen
-    because a contact point on one dish moves by less from frame to frame."""
-
-
-ADJUSTMENT_EFFECT = AdjustmentEffectSettings()
+# m: displacement of a contact point above which the text says "jumps" and not "moves". Chosen
+# because a contact point on one dish moves by less from frame to frame.
+JUMP_DISTANCE = 5.0 * MILLIMETRE
 
 
 @dataclass(frozen=True)
@@ -188,7 +174,7 @@ def _largest_move(
         for side in adjusted
     }
     side = max(distances, key=lambda name: distances[name])
-    verb = "jumps" if distances[side] > ADJUSTMENT_EFFECT.jump_distance else "moves"
+    verb = "jumps" if distances[side] > JUMP_DISTANCE else "moves"
     return f"the {side} contact point {verb} by {distances[side] / MILLIMETRE:.1f} mm"
 
 

@@ -286,17 +286,10 @@ def _hip(femur: FixedFrame, path: tuple[int, ...]) -> FixedFrame:
     return femur if femur.joint in path else FixedFrame(femur.joint, pin.SE3.Identity())
 
 
-@dataclass(frozen=True)
-class AnatomySettings:
-    """Check that femur and tibia are not exchanged."""
-
-    least_lever: float = 0.05
-    """m: a thigh whose centre of mass lies farther below the femoral component, with a shank whose
-    centre of mass lies farther above the insert, are exchanged. Chosen because the centres of mass
-    of thigh and shank lie 0.15 to 0.3 m from the knee."""
-
-
-ANATOMY = AnatomySettings()
+# m: a thigh whose centre of mass lies farther below the femoral component, with a shank whose
+# centre of mass lies farther above the insert, are exchanged. Chosen because the centres of mass
+# of thigh and shank lie 0.15 to 0.3 m from the knee.
+LEAST_LEVER = 0.05
 
 
 def check_not_exchanged(anatomy: Anatomy) -> None:
@@ -306,7 +299,7 @@ def check_not_exchanged(anatomy: Anatomy) -> None:
         InputError: the femur's centre of mass lies below the knee, and the tibia's above it.
     """
     levers = [_centre_height(anatomy.model, frame) for frame in (anatomy.femoral, anatomy.insert)]
-    if -levers[0] > ANATOMY.least_lever and levers[1] > ANATOMY.least_lever:
+    if -levers[0] > LEAST_LEVER and levers[1] > LEAST_LEVER:
         raise InputError(
             f"femur and tibia are exchanged: the femur's centre of mass lies {-levers[0]:.2f} m "
             f"below the femoral component, the tibia's {levers[1]:.2f} m above the insert",

@@ -43,22 +43,16 @@ if TYPE_CHECKING:
     from tkamb.knee.patella import PatellaState
 
 
-@dataclass(frozen=True)
-class KneeCheckSettings:
-    """Checks of a configuration."""
+# 1: largest error of a quaternion's norm. Chosen because an error of this size changes a force by
+# a millionth.
+UNIT_TOLERANCE = 1e-6
+# m: largest distance of the components. Chosen because the ligaments of a knee tear at 20 mm of
+# distraction.
+MAX_DISTANCE = 0.1
+# rad: largest angle of a joint of the knee; a larger one is probably in degrees. Chosen because no
+# joint of a knee makes a full turn.
+MAX_TURN = 2.0 * np.pi
 
-    unit_tolerance: float = 1e-6
-    """1: largest error of a quaternion's norm. Chosen because an error of this size changes a force
-    by a millionth."""
-    max_distance: float = 0.1
-    """m: largest distance of the components. Chosen because the ligaments of a knee tear at 20 mm
-    of distraction."""
-    max_turn: float = 2.0 * np.pi
-    """rad: largest angle of a joint of the knee; a larger one is probably in degrees. Chosen
-    because no joint of a knee makes a full turn."""
-
-
-KNEE_CHECK = KneeCheckSettings()
 
 PATELLAR_LIGAMENT = "patellar_ligament"
 """Name of the patellar ligament among the tensions."""
@@ -337,10 +331,10 @@ class AssembledKnee:
         q = self._check(q, "q", self.model.nq)
         # 60 rad have a valid pose, of another flexion: the result would look right.
         for k, joint in self.anatomy.angles.items():
-            if abs(q[k]) > KNEE_CHECK.max_turn:
+            if abs(q[k]) > MAX_TURN:
                 words = f"joint '{joint}' is at {q[k]:.4g} rad; is it in degrees?"
                 raise InputError(words, "Knee", "give q in radians")
-        if not pin.isNormalized(self.model, q, KNEE_CHECK.unit_tolerance) and np.isfinite(q).all():
+        if not pin.isNormalized(self.model, q, UNIT_TOLERANCE) and np.isfinite(q).all():
             unit = q.copy()
             pin.normalize(self.model, unit)
             error = float(np.abs(q - unit).max())
@@ -363,7 +357,7 @@ class AssembledKnee:
         centre = pose[:3, :3] @ bounds.mean(axis=0) + pose[:3, 3]
         apart = float(np.linalg.norm(np.maximum(np.maximum(low - centre, centre - high), 0.0)))
         apart -= 0.5 * float(np.linalg.norm(bounds[1] - bounds[0]))
-        if apart > KNEE_CHECK.max_distance:
+        if apart > MAX_DISTANCE:
             words = f"the femoral component is {apart:.3g} m or more away from the insert"
         elif centre[1] < low[1]:
             words = (

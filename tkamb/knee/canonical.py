@@ -35,22 +35,15 @@ from tkamb.knee.anatomy import Anatomy, FixedFrame, knee_size
 from tkamb.knee.chain import Chain, ChainMotion, ChainState
 from tkamb.knee.load import LinkPoint, PointForces, wrenches
 
+# m and rad: pose error below which the iteration has converged. Chosen because it is near the
+# rounding error of double precision.
+POSE_TOLERANCE = 1e-12
+# m and rad: largest pose error that is accepted after the last Newton step. Chosen because such an
+# error does not change a force noticeably.
+ACCEPTED_POSE_ERROR = 1e-8
+# Maximum number of Newton steps. Chosen because a pose that converges needs fewer.
+MAX_POSE_STEPS = 30
 
-@dataclass(frozen=True)
-class KneeSettings:
-    """Newton's method for the joint coordinates that put the knee into a given pose."""
-
-    pose_tolerance: float = 1e-12
-    """m and rad: pose error below which the iteration has converged. Chosen because it is near the
-    rounding error of double precision."""
-    accepted_pose_error: float = 1e-8
-    """m and rad: largest pose error that is accepted after the last Newton step. Chosen because
-    such an error does not change a force noticeably."""
-    max_pose_steps: int = 30
-    """Maximum number of Newton steps. Chosen because a pose that converges needs fewer."""
-
-
-KNEE = KneeSettings()
 
 _TWIST_MIRROR = np.array([1.0, 1.0, -1.0, -1.0, -1.0, 1.0])
 """Signs of a twist or wrench (linear or force first) in the mirror image (z to -z)."""
@@ -362,19 +355,19 @@ class Bridge:
             for k in range(model.joints[joint].nv)
         ]
         q = np.array(q, float)
-        for _ in range(KNEE.max_pose_steps):
+        for _ in range(MAX_POSE_STEPS):
             pin.forwardKinematics(model, data, q)
             insert = data.oMi[self.insert.joint] * self.insert.placement
             femur = data.oMi[self.component.joint] * self.component.placement
             # Pose error as a twist in the insert frame. The joints must produce this twist.
             error = pin.log6(placement * insert.actInv(femur).inverse()).vector
-            if np.abs(error).max() < KNEE.pose_tolerance:
+            if np.abs(error).max() < POSE_TOLERANCE:
                 return q
             jacobian = self.relative_jacobian(data, q)[:, columns]
             step = np.zeros(model.nv)
             step[columns] = np.linalg.lstsq(jacobian, error, rcond=None)[0]
             q = pin.integrate(model, q, step)
-        if np.abs(error).max() < KNEE.accepted_pose_error:
+        if np.abs(error).max() < ACCEPTED_POSE_ERROR:
             return q
         raise InputError(
             f"the {knee_size(self.anatomy)} degrees of freedom between tibia and femur do not "

@@ -52,25 +52,19 @@ if TYPE_CHECKING:
     from tkamb.knee.patella import PatellaState
 
 
-@dataclass(frozen=True)
-class ForceDerivativeSettings:
-    """Inner central differences of the extensor mechanism and of joint twists."""
+# m: step of the femur's pose. Chosen because rounding errors are below 1e-9 and the error of the
+# difference is below 1e-8 of the derivative.
+POSE_STEP = 1e-6
+# m: step of the patella's coordinates. Chosen shorter, because the facets under the button are
+# short.
+PATELLA_STEP = 1e-7
+# m: lever arm; a rotation's step is the step over this arm. Chosen as half the distance of the
+# condyles.
+FORCE_DERIVATIVE_ARM = 0.025
+# m and rad: step of q for the twist of a model with mimic joints, for which Pinocchio has no
+# velocity derivatives. Chosen as `POSE_STEP`.
+JOINT_STEP = 1e-6
 
-    pose_step: float = 1e-6
-    """m: step of the femur's pose. Chosen because rounding errors are below 1e-9 and the error of
-    the difference is below 1e-8 of the derivative."""
-    patella_step: float = 1e-7
-    """m: step of the patella's coordinates. Chosen shorter, because the facets under the button are
-    short."""
-    arm: float = 0.025
-    """m: lever arm; a rotation's step is the step over this arm. Chosen as half the distance of the
-    condyles."""
-    joint_step: float = 1e-6
-    """m and rad: step of q for the twist of a model with mimic joints, for which Pinocchio has no
-    velocity derivatives. Chosen as `pose_step`."""
-
-
-FORCE_DERIVATIVE = ForceDerivativeSettings()
 
 LINKS = ("tibia", "femur", "patella")
 
@@ -243,7 +237,7 @@ def twist_derivative(knee: "Knee", data: Any, femur: Array, q: Array, v: Array) 
 
 def _twist_differences(knee: "Knee", q: Array, v: Array) -> Array:
     """Return the result of `twist_derivative` by central differences of J(q) v."""
-    model, step = knee.model, FORCE_DERIVATIVE.joint_step
+    model, step = knee.model, JOINT_STEP
     columns = []
     for direction in step * np.eye(model.nv):
         ahead, behind = (
@@ -343,14 +337,14 @@ def _pose_differences(values: Callable[[Array], Array], pose: Array) -> Array:
     """Return the derivative (n, 6) of values (n,) by a displacement of the femur."""
     from tkamb.knee.contact import DifferenceSettings, differences
 
-    settings = DifferenceSettings(step=FORCE_DERIVATIVE.pose_step, arm=FORCE_DERIVATIVE.arm)
+    settings = DifferenceSettings(step=POSE_STEP, arm=FORCE_DERIVATIVE_ARM)
     return differences(values, pose, settings)
 
 
 def _patella_differences(values: Callable[[Array], Array], coordinates: Array) -> Array:
     """Return the derivative (n, 3) of values (n,) by the patella's coordinates."""
-    step, columns = FORCE_DERIVATIVE.patella_step, []
-    for k, size in enumerate((step, step, step / FORCE_DERIVATIVE.arm)):
+    step, columns = PATELLA_STEP, []
+    for k, size in enumerate((step, step, step / FORCE_DERIVATIVE_ARM)):
         move = size * np.eye(3)[k]
         columns.append((values(coordinates + move) - values(coordinates - move)) / (2.0 * size))
     return np.array(columns).T

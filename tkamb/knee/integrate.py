@@ -15,7 +15,6 @@ doi:10.1007/3-540-30666-8.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,22 +24,15 @@ from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array
 from tkamb.knee.knee import Knee, KneeData
 
+# m/s and rad/s: residual of the step's equation below which Newton's method has converged. Chosen
+# because it is far below any speed of a knee.
+VELOCITY_TOLERANCE = 1e-8
+# m/s and rad/s: residual below which the step is accepted if Newton's method no longer reduces it.
+# Chosen as a thousand times `VELOCITY_TOLERANCE`.
+STAGNATION_TOLERANCE = 1e-5
+# Maximum number of Newton steps. Chosen because a time step that converges needs fewer.
+MAX_NEWTON_STEPS = 40
 
-@dataclass(frozen=True)
-class ImplicitStepSettings:
-    """An implicit time step of the knee."""
-
-    velocity_tolerance: float = 1e-8
-    """m/s and rad/s: residual of the step's equation below which Newton's method has converged.
-    Chosen because it is far below any speed of a knee."""
-    stagnation_tolerance: float = 1e-5
-    """m/s and rad/s: residual below which the step is accepted if Newton's method no longer reduces
-    it. Chosen as a thousand times `velocity_tolerance`."""
-    max_newton_steps: int = 40
-    """Maximum number of Newton steps. Chosen because a time step that converges needs fewer."""
-
-
-IMPLICIT_STEP = ImplicitStepSettings()
 
 REUSE_BELOW = 0.2
 """1: the Jacobian is reused if the last Newton step left less than this share of the residual."""
@@ -84,7 +76,7 @@ def implicit_step(
     torques = np.zeros(model.nv) if tau is None else tau
     cache, v_end, last_norm = model.createData(), np.array(v, float), np.inf
     change, residual_jacobian = np.zeros(model.nv), None
-    for _ in range(IMPLICIT_STEP.max_newton_steps):
+    for _ in range(MAX_NEWTON_STEPS):
         v_middle = (1.0 - theta) * v + theta * v_end
         q_middle = pin.integrate(model, q, theta * step * v_middle)
         try:
@@ -103,8 +95,8 @@ def implicit_step(
         # Residual of the equation for the velocity at the end of the step.
         residual = v_end - v - step * pin.aba(model, cache, q_middle, v_middle, torque, forces)
         residual_norm = float(np.abs(residual).max())
-        if residual_norm < IMPLICIT_STEP.velocity_tolerance or (
-            last_norm <= residual_norm < IMPLICIT_STEP.stagnation_tolerance
+        if residual_norm < VELOCITY_TOLERANCE or (
+            last_norm <= residual_norm < STAGNATION_TOLERANCE
         ):
             return pin.integrate(model, q, step * v_middle), v_end
         if residual_jacobian is None or residual_norm > REUSE_BELOW * last_norm:

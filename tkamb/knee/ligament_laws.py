@@ -31,17 +31,9 @@ from tkamb.contact.named_classes import NamedClasses
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 
-
-@dataclass(frozen=True)
-class LigamentLawSettings:
-    """Toe strain of ligaments."""
-
-    toe_strain: float = 0.03
-    """1: eps1 of every ligament. The toe region ends at twice this strain. Source: Blankevoort &
-    Huiskes (1991)."""
-
-
-LIGAMENT_LAW = LigamentLawSettings()
+# 1: eps1 of every ligament. The toe region ends at twice this strain. Source: Blankevoort &
+# Huiskes (1991).
+TOE_STRAIN = 0.03
 
 
 @dataclass(frozen=True)
@@ -112,7 +104,7 @@ class TwoLine(LigamentLaw):
         length, slack = np.asarray(length, float), np.asarray(slack_length, float)
         # The first line has half the slope of the second line. They meet at twice the toe strain.
         toe = 0.5 * np.asarray(self.stiffness) * (length - slack)
-        line = np.asarray(self.stiffness) * (length - (1.0 + LIGAMENT_LAW.toe_strain) * slack)
+        line = np.asarray(self.stiffness) * (length - (1.0 + TOE_STRAIN) * slack)
         return _by_region((length - slack) / slack, toe, line)
 
     def slope(self, length: ArrayLike, slack_length: ArrayLike) -> Array:
@@ -134,23 +126,21 @@ class QuadraticToe(LigamentLaw):
         length, slack = np.asarray(length, float), np.asarray(slack_length, float)
         strain = (length - slack) / slack
         # Force and slope are continuous where the parabola meets the line, at twice the toe strain.
-        toe = np.asarray(self.stiffness) * strain**2 / (4.0 * LIGAMENT_LAW.toe_strain)
-        line = np.asarray(self.stiffness) * (strain - LIGAMENT_LAW.toe_strain)
+        toe = np.asarray(self.stiffness) * strain**2 / (4.0 * TOE_STRAIN)
+        line = np.asarray(self.stiffness) * (strain - TOE_STRAIN)
         return _by_region(strain, toe, line)
 
     def slope(self, length: ArrayLike, slack_length: ArrayLike) -> Array:
         """Return the slope, N/m."""
         slack = np.asarray(slack_length, float)
         strain = np.asarray(length, float) / slack - 1.0
-        share = np.clip(strain / (2.0 * LIGAMENT_LAW.toe_strain), 0.0, 1.0)
+        share = np.clip(strain / (2.0 * TOE_STRAIN), 0.0, 1.0)
         return np.asarray(share * np.asarray(self.stiffness) / slack)
 
 
 def _by_region(strain: Array, toe: Array, line: Array) -> Array:
     """Return zero for a slack bundle, else the value of the toe or of the line."""
-    return np.where(
-        strain <= 0.0, 0.0, np.where(strain <= 2.0 * LIGAMENT_LAW.toe_strain, toe, line)
-    )
+    return np.where(strain <= 0.0, 0.0, np.where(strain <= 2.0 * TOE_STRAIN, toe, line))
 
 
 LIGAMENT_LAWS = NamedClasses(

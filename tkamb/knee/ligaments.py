@@ -26,17 +26,9 @@ from tkamb.knee.ligament_laws import LIGAMENT_LAWS, LigamentLaw, StackedLaws, Tw
 from tkamb.knee.load import LinkPoint, PointForces, wrench_of
 from tkamb.units import DEGREE, MILLIMETRE
 
-
-@dataclass(frozen=True)
-class LigamentSettings:
-    """Reference pose of ligaments."""
-
-    max_reference_distance: float = 15.0 * DEGREE
-    """rad: largest difference between the reference flexion and the flexion of the nearest frame.
-    Chosen because at a larger difference the strain differs."""
-
-
-LIGAMENT = LigamentSettings()
+# rad: largest difference between the reference flexion and the flexion of the nearest frame.
+# Chosen because at a larger difference the strain differs.
+MAX_REFERENCE_DISTANCE = 15.0 * DEGREE
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,7 +222,7 @@ def _with_slack_length(bundle: Ligament, poses: Mapping[str, Array], flexion: Ar
     # A slack length that is given needs no reference pose.
     if not np.isnan(bundle.slack_length):
         return bundle
-    if abs(flexion[reference] - bundle.reference_flexion) > LIGAMENT.max_reference_distance:
+    if abs(flexion[reference] - bundle.reference_flexion) > MAX_REFERENCE_DISTANCE:
         raise InputError(
             f"its reference pose is at {bundle.reference_flexion / DEGREE:g} deg of flexion, but "
             f"the nearest recorded frame is at {flexion[reference] / DEGREE:.0f} deg",
@@ -286,17 +278,10 @@ def _frame(poses: Mapping[str, Array], k: int) -> dict[str, Array]:
     }
 
 
-@dataclass(frozen=True)
-class LigamentSideSettings:
-    """Check of the side of a collateral ligament."""
-
-    wrong_side_distance: float = 8.0 * MILLIMETRE
-    """m: an end farther than this beyond the middle of the knee is on the wrong side. Chosen
-    because collateral ligaments end 20 to 45 mm from the middle, and the frames' origins lie closer
-    to the middle than this distance."""
-
-
-LIGAMENT_SIDE = LigamentSideSettings()
+# m: an end farther than this beyond the middle of the knee is on the wrong side. Chosen because
+# collateral ligaments end 20 to 45 mm from the middle, and the frames' origins lie closer to the
+# middle than this distance.
+WRONG_SIDE_DISTANCE = 8.0 * MILLIMETRE
 
 
 _KINDS = r"(collateral|retinacul|patell[ao])"
@@ -326,7 +311,7 @@ def check_collateral_sides(ligaments: Iterable[Ligament], chain: Chain, side: st
         sign = _lateral_sign(bundle.name)
         for name, end in (("proximal", bundle.proximal), ("distal", bundle.distal)):
             lateral = _lateral_position(end, chain)
-            if sign * lateral < -LIGAMENT_SIDE.wrong_side_distance:
+            if sign * lateral < -WRONG_SIDE_DISTANCE:
                 opposite, named_side = ("lateral", "medial") if sign < 0 else ("medial", "lateral")
                 raise InputError(
                     f"its {name} end lies {abs(lateral) / MILLIMETRE:.0f} mm on the {opposite} "

@@ -22,16 +22,9 @@ class LinkPoint:
     position: Array
 
 
-@dataclass(frozen=True)
-class PointSettings:
-    """Check of the unit of attachment points."""
-
-    max_distance: float = 1.0
-    """m: a point farther from its frame is refused, because it is probably in millimetres. Chosen
-    because a leg is 0.9 m long, and 1 mm is the smallest useful coordinate in millimetres."""
-
-
-POINT = PointSettings()
+# m: a point farther from its frame is refused, because it is probably in millimetres. Chosen
+# because a leg is 0.9 m long, and 1 mm is the smallest useful coordinate in millimetres.
+MAX_DISTANCE = 1.0
 
 
 Point = LinkPoint | tuple[str, Sequence[float]]
@@ -113,7 +106,7 @@ def link_point(point: Point) -> LinkPoint:
             "give (frame name, (x, y, z)) in metres",
         )
     distance = float(np.linalg.norm(coordinates))
-    if distance > POINT.max_distance:
+    if distance > MAX_DISTANCE:
         raise InputError(
             f"a point lies {distance:.4g} m from the frame '{link}'",
             "Knee",

@@ -25,16 +25,9 @@ if TYPE_CHECKING:
     from tkamb.knee.wrapping import TautPath
 
 
-@dataclass(frozen=True)
-class MuscleBandSettings:
-    """Settings of the outline that a muscle or ligament wraps."""
-
-    sections: int = 7
-    """Number of sagittal sections across the band. A line wraps the convex outline of all sections.
-    Chosen because more sections hardly change the lines."""
-
-
-MUSCLE_BAND = MuscleBandSettings()
+# Number of sagittal sections across the band. A line wraps the convex outline of all sections.
+# Chosen because more sections hardly change the lines.
+SECTIONS = 7
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +53,7 @@ class SagittalWrap:
             below: largest y, m; the surfaces above it are ignored.
         """
         surfaces = [part] if self.bone is None else [part, self.bone]
-        planes = middle + np.linspace(-self.band, self.band, MUSCLE_BAND.sections)
+        planes = middle + np.linspace(-self.band, self.band, SECTIONS)
         return sagittal_outline(surfaces, planes, self.half_thickness, below=below)
 
 

@@ -38,16 +38,9 @@ Mesh = Any
 """A `trimesh.Trimesh`, a pair (vertices (n, 3) m, triangles (k, 3)), or a `Surface`."""
 
 
-@dataclass(frozen=True)
-class PartSettings:
-    """Checks of the implant meshes."""
-
-    max_length: float = 0.5
-    """m: a longer mesh is refused, because it is probably in millimetres. Chosen because no part of
-    an implant is longer."""
-
-
-PART = PartSettings()
+# m: a longer mesh is refused, because it is probably in millimetres. Chosen because no part of an
+# implant is longer.
+MAX_LENGTH = 0.5
 
 
 def check_names(what: str, names: Sequence[str]) -> None:
@@ -69,7 +62,7 @@ def check_length(length: float, what: str, where: str) -> None:
     """
     if not length > 0:
         raise InputError(f"{what} {length} m", where, f"give {what} in metres")
-    if length > PART.max_length:
+    if length > MAX_LENGTH:
         raise InputError(f"{what} {length:.4g} m", where, "is it in millimetres? give metres")
 
 
@@ -154,7 +147,7 @@ def as_surface(mesh: Mesh, name: str, closed: bool = False) -> Surface:
     if not np.isfinite(vertices).all():
         raise InputError("holds coordinates that are not finite", name, "check the mesh")
     extent = float(np.ptp(vertices, axis=0).max())
-    if not 0.0 < extent < PART.max_length:
+    if not 0.0 < extent < MAX_LENGTH:
         raise InputError(
             f"is {extent:.4g} m long",
             name,
@@ -187,16 +180,9 @@ def _arrays(mesh: Mesh, name: str) -> tuple[Array, Any]:
     return vertices.astype(float), faces.astype(np.int64)
 
 
-@dataclass(frozen=True)
-class AssemblySettings:
-    """Tolerance of the assembly."""
-
-    frame_tolerance: float = 1e-9
-    """m and rad: difference between the mesh frame and the frame of the flat bottom below which the
-    two are equal. Chosen because it is above rounding errors."""
-
-
-ASSEMBLY = AssemblySettings()
+# m and rad: difference between the mesh frame and the frame of the flat bottom below which the two
+# are equal. Chosen because it is above rounding errors.
+FRAME_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +234,7 @@ def placed_insert(
     from tkamb.geometry.flat_bottom import insert_placement
 
     placement = insert_placement(insert)
-    if np.abs(placement - np.eye(4)).max() < ASSEMBLY.frame_tolerance:
+    if np.abs(placement - np.eye(4)).max() < FRAME_TOLERANCE:
         return frame, insert
     # A left knee needs the mirror image, because the placement is that of the mirrored mesh.
     mesh_in_insert = mirrored_pose(placement) if is_left else placement

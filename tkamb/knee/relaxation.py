@@ -19,28 +19,22 @@ References: Irons & Tuck, Int J Numer Methods Eng 1:275 (1969), doi:10.1002/nme.
 Küttler & Wall, Comput Mech 43:61 (2008), doi:10.1007/s00466-008-0255-5.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tkamb.geometry.frames import Array
-from tkamb.knee.released_forces import RELEASED_FORCE
+from tkamb.knee.released_forces import LEVER_ARM
 
 if TYPE_CHECKING:
     from tkamb.knee.crossing import MuscleShare
 
 
-@dataclass(frozen=True)
-class MuscleIterationSettings:
-    """The iteration between muscle forces and knee equilibrium."""
+# N: largest difference of a muscle's required force from its applied force at which the iteration
+# has converged. Chosen as a thousandth of a usual muscle force.
+MUSCLE_FORCE_TOLERANCE = 1.0
 
-    muscle_force_tolerance: float = 1.0
-    """N: largest difference of a muscle's required force from its applied force at which the
-    iteration has converged. Chosen as a thousandth of a usual muscle force."""
-
-
-MUSCLE_ITERATION = MuscleIterationSettings()
 
 LEAST, MOST = 0.05, 1.0
 """Smallest and largest omega."""
@@ -49,9 +43,7 @@ LEAST, MOST = 0.05, 1.0
 STEPS = ((4, 1.0), (8, 0.5), (16, 0.25))
 """Pairs (number of passes, share): up to this pass the compliance changes by this share of the
 difference from the measured compliance."""
-TURNS = np.array(
-    [1.0, 1.0, 1.0, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm]
-)
+TURNS = np.array([1.0, 1.0, 1.0, LEVER_ARM, LEVER_ARM, LEVER_ARM])
 """1 and m: factors that make the compliances to forces and moments comparable."""
 
 
@@ -110,7 +102,7 @@ class Relaxation:
             )
             self._factor = float(np.clip(factor, LEAST, MOST))
         self._last_difference = difference
-        self.converged = bool(np.abs(difference).max() < MUSCLE_ITERATION.muscle_force_tolerance)
+        self.converged = bool(np.abs(difference).max() < MUSCLE_FORCE_TOLERANCE)
         if not self.converged:
             self._applied = replace(
                 required,

@@ -258,23 +258,15 @@ def crossing_bundles(
     return BundleArrays.of(crossing, np.array(femur), np.array(shank))
 
 
-@dataclass(frozen=True)
-class ReleasedForceSettings:
-    """Scaling and step of the forces on released coordinates."""
-
-    lever_arm: float = 0.025
-    """m: arm that makes rotations comparable to translations. Chosen as half the usual distance of
-    the condyles."""
-    difference_step: float = 1e-7
-    """m: step of the finite differences of joint axes and ligaments. Chosen because it is far above
-    rounding errors and far below any radius of curvature."""
+# m: arm that makes rotations comparable to translations. Chosen as half the usual distance of the
+# condyles.
+LEVER_ARM = 0.025
+# m: step of the finite differences of joint axes and ligaments. Chosen because it is far above
+# rounding errors and far below any radius of curvature.
+DIFFERENCE_STEP = 1e-7
 
 
-RELEASED_FORCE = ReleasedForceSettings()
-
-SCALE = np.array(
-    [1.0, 1.0, 1.0, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm, RELEASED_FORCE.lever_arm]
-)
+SCALE = np.array([1.0, 1.0, 1.0, LEVER_ARM, LEVER_ARM, LEVER_ARM])
 
 Sliding = Callable[[Array, Array], Array]
 
@@ -372,9 +364,9 @@ class FreeForces(Generic[J]):
             return Trial(force, force_noise=force_noise)
         # Forces at displaced coordinates; the last row is at the coordinates themselves.
         steps = np.zeros((len(x) + 1, 6))
-        steps[np.arange(len(x)), self._rows] = RELEASED_FORCE.difference_step / self._scale
+        steps[np.arange(len(x)), self._rows] = DIFFERENCE_STEP / self._scale
         forces = self._joint.residual(coordinates + steps, wrench) / self._scale
-        change = (forces[:-1] - forces[-1]).T / RELEASED_FORCE.difference_step
+        change = (forces[:-1] - forces[-1]).T / DIFFERENCE_STEP
         twists = knee_axes(coordinates)[self._rows] / self._scale[:, None]
         gain = self._joint.contact_gain(coordinates) / self._scale[:, None]
         tangent = -(change + gain @ stiffness @ twists.T)
@@ -436,13 +428,11 @@ class ReleasedForces(FreeForces[JointEquilibrium]):
         if stiffness is None:
             return None
         steps = np.zeros((len(self._rows) + 1, 6))
-        steps[np.arange(len(self._rows)), self._rows] = RELEASED_FORCE.difference_step / self._scale
+        steps[np.arange(len(self._rows)), self._rows] = DIFFERENCE_STEP / self._scale
         forces = self._joint.forces_on_all_coordinates(coordinates + steps, wrench)
         axes = knee_axes(coordinates)
         twists = axes[self._rows] / self._scale[:, None]
-        change = (
-            forces[:-1] - forces[-1]
-        ).T / RELEASED_FORCE.difference_step - axes @ stiffness @ twists.T
+        change = (forces[:-1] - forces[-1]).T / DIFFERENCE_STEP - axes @ stiffness @ twists.T
         # The unknowns are dq and dy. The ligament's tension is the last entry of y.
         matrix = np.hstack([-change, axes @ self._joint.columns(coordinates)])
         return np.asarray(-np.linalg.solve(matrix, axes)[-1])

@@ -1,7 +1,6 @@
 """The knee drawn in a user's own MeshCat window."""
 
 import weakref
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -22,26 +21,18 @@ COLOURS = {"femoral": 0xB8C4CE, "insert": 0xEFEBDD, "patella": 0xEFEBDD}
 LIGAMENT, MUSCLE, ARROW = 0x2E7D32, 0xB71C1C, 0x1A1A1A
 
 
-@dataclass(frozen=True)
-class KneeDrawingSettings:
-    """Sizes in the drawing."""
+# m: radius of the force arrows. Chosen because it is easy to see.
+ARROW_RADIUS = 1.5e-3
+# m: radius of ligaments, muscles and the patellar ligament. Chosen because it is easy to see.
+STRAND_RADIUS = 8e-4
+# m: distance of the camera from the knee. Chosen because the implant then fills the window.
+LOOK_DISTANCE = 0.15
+# m: height above the insert's origin at which the camera looks. Chosen as the height of the joint.
+LOOK_HEIGHT = 0.02
+# 1: direction to the camera, insert frame of a right knee: anterior, superior, lateral. Chosen
+# because both condyles and the pressure map are in view.
+LOOK_DIRECTION = (0.77, 0.40, 0.50)
 
-    arrow_radius: float = 1.5e-3
-    """m: radius of the force arrows. Chosen because it is easy to see."""
-    strand_radius: float = 8e-4
-    """m: radius of ligaments, muscles and the patellar ligament. Chosen because it is easy to
-    see."""
-    look_distance: float = 0.15
-    """m: distance of the camera from the knee. Chosen because the implant then fills the window."""
-    look_height: float = 0.02
-    """m: height above the insert's origin at which the camera looks. Chosen as the height of the
-    joint."""
-    look_direction: tuple[float, float, float] = (0.77, 0.40, 0.50)
-    """1: direction to the camera, insert frame of a right knee: anterior, superior, lateral. Chosen
-    because both condyles and the pressure map are in view."""
-
-
-KNEE_DRAWING = KneeDrawingSettings()
 
 PRESSURE_COLOURS = np.array([[0.27, 0.0, 0.33], [0.13, 0.57, 0.55], [0.99, 0.91, 0.14]])
 """RGB from no pressure to the peak: three colours of viridis, whose lightness increases evenly."""
@@ -128,7 +119,7 @@ def show_knee(
             force = contact.nodal_force[_side(contact, knee, side)].sum(axis=0)
             start = condyle.centre_of_pressure
             path = in_world(np.array([start, start - newton * force]))
-            _strand(tree["force"][side], path, ARROW, KNEE_DRAWING.arrow_radius)
+            _strand(tree["force"][side], path, ARROW, ARROW_RADIUS)
 
 
 _SEEN: "weakref.WeakSet[Any]" = weakref.WeakSet()
@@ -144,14 +135,14 @@ def _look_at(window: Any, insert: Array, is_left: bool) -> None:
     turn = np.column_stack([np.eye(3)[0], np.eye(3)[2], -np.eye(3)[1]])  # insert x, y, z
     view = np.eye(4)
     view[:3, :3] = turn @ insert[:3, :3].T
-    middle = insert[:3, 3] + KNEE_DRAWING.look_height * insert[:3, 1]
+    middle = insert[:3, 3] + LOOK_HEIGHT * insert[:3, 1]
     view[:3, 3] = -view[:3, :3] @ middle
     window["/meshcat"].set_transform(view)
     for node in ("/Grid", "/Axes"):
         window[node].set_property("visible", False)
     # The camera's own axes are y up: those of the insert.
     side = np.array([1.0, 1.0, -1.0 if is_left else 1.0])
-    place = KNEE_DRAWING.look_distance * side * np.array(KNEE_DRAWING.look_direction)
+    place = LOOK_DISTANCE * side * np.array(LOOK_DIRECTION)
     window["/Cameras/default/rotated/<object>"].set_property("position", place.tolist())
 
 
@@ -188,9 +179,7 @@ def _solid(
     node.set_transform(pose)
 
 
-def _strand(
-    node: Any, points: Array, colour: int, radius: float = KNEE_DRAWING.strand_radius
-) -> None:
+def _strand(node: Any, points: Array, colour: int, radius: float = STRAND_RADIUS) -> None:
     """Draw a polyline (n, 3) in the world frame as cylinders."""
     for k, (start, end) in enumerate(pairwise(points)):
         along = end - start

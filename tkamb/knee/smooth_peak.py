@@ -9,7 +9,7 @@ of the pressures p_i at the map points with the areas A_i tends to the peak as n
 come into contact do not disturb it, because p^n is smooth there.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,19 +18,11 @@ from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array
 from tkamb.knee.contact import CONTACT_DIFFERENCE, KneeContact, differences
 
-
-@dataclass(frozen=True)
-class SmoothPeakSettings:
-    """The mean of high order that replaces the peak pressure."""
-
-    order: int = 8
-    """1: order n of the mean. Chosen because a paraboloid of pressure over 1 cm² then has 0.76 of
-    its peak, and a larger order weighs single columns."""
-    area: float = 1e-4
-    """m²: area A0. Chosen as the usual area of contact of a condyle."""
-
-
-SMOOTH_PEAK = SmoothPeakSettings()
+# 1: order n of the mean. Chosen because a paraboloid of pressure over 1 cm² then has 0.76 of its
+# peak, and a larger order weighs single columns.
+ORDER = 8
+# m²: area A0. Chosen as the usual area of contact of a condyle.
+AREA = 1e-4
 
 
 def smooth_peaks(contact: KneeContact, femur_pose: Array) -> Array:
@@ -44,9 +36,9 @@ def smooth_peaks(contact: KneeContact, femur_pose: Array) -> Array:
         raise ComputationError(result.reason, "contact")
     medial = medial_points(result.points, femur_pose, contact.pair.split)
     largest = max(float(result.pressure.max()), 1.0)
-    share = result.area / SMOOTH_PEAK.area * (result.pressure / largest) ** SMOOTH_PEAK.order
+    share = result.area / AREA * (result.pressure / largest) ** ORDER
     sums = np.array([share[medial].sum(), share[~medial].sum()])
-    return np.asarray(largest * sums ** (1.0 / SMOOTH_PEAK.order))
+    return np.asarray(largest * sums ** (1.0 / ORDER))
 
 
 def smooth_peak_slopes(contact: KneeContact, femur_pose: Array) -> Array:

@@ -27,19 +27,11 @@ from tkamb.geometry.frames import Array, cross
 from tkamb.knee.contact_points import CondylePoint
 from tkamb.knee.load import PointForces
 
-
-@dataclass(frozen=True)
-class UnknownsSettings:
-    """Limit at which the equations count as singular."""
-
-    max_condition: float = 1e4
-    """1: condition number (unit columns) above which a frame counts as singular. The number is
-    about 7 to 9 m / d, where d is the moment arm of the patellar ligament about the femorotibial
-    contact. Chosen because at the limit, d = 0.8 mm, an error of 1 mm in a line of action changes
-    the force by more than 100 %."""
-
-
-UNKNOWNS = UnknownsSettings()
+# 1: condition number (unit columns) above which a frame counts as singular. The number is about 7
+# to 9 m / d, where d is the moment arm of the patellar ligament about the femorotibial contact.
+# Chosen because at the limit, d = 0.8 mm, an error of 1 mm in a line of action changes the force
+# by more than 100 %.
+MAX_CONDITION = 1e4
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +79,7 @@ def solve(names: Sequence[str], columns: Array, right: Array) -> Solution:
     # With unit columns the condition number measures the geometry, not the units N and N·m.
     scaled = columns / np.where(size > 0, size, 1.0)
     condition = float(np.linalg.cond(scaled))
-    regular = bool(np.isfinite(condition) and condition < UNKNOWNS.max_condition)
+    regular = bool(np.isfinite(condition) and condition < MAX_CONDITION)
     magnitudes = np.linalg.solve(scaled, right) / size if regular else np.full(len(right), np.nan)
     return Solution(dict(zip(names, magnitudes.tolist(), strict=True)), condition, regular)
 
@@ -211,19 +203,11 @@ def residuals(point: Array, lifted: bool, extensor: bool) -> list[Unknown]:
     return unknowns
 
 
-@dataclass(frozen=True)
-class LoadStateSettings:
-    """Limits for the signs of the loads."""
-
-    force_rounding: float = 1e-6
-    """N: a smaller force of the wrong sign counts as zero. Chosen because it is above rounding
-    errors."""
-    patella_moment: float = 0.25
-    """N·m: largest extension moment that may be missing if the extensor mechanism is slack. Chosen
-    because weight and inertia of the patella, up to 5 N on an arm of 45 mm, cause such a moment."""
-
-
-LOAD_STATE = LoadStateSettings()
+# N: a smaller force of the wrong sign counts as zero. Chosen because it is above rounding errors.
+FORCE_ROUNDING = 1e-6
+# N·m: largest extension moment that may be missing if the extensor mechanism is slack. Chosen
+# because weight and inertia of the patella, up to 5 N on an arm of 45 mm, cause such a moment.
+PATELLA_MOMENT = 0.25
 
 
 PATELLAR_LOADS = ("patellar_ligament", "patellofemoral")
@@ -286,12 +270,12 @@ def wrong_signs(state: LoadState, solution: Solution) -> list[str]:
     wrong = [
         f"{name.removeprefix(MUSCLE).replace('_', ' ')} {values[name]:.3g} N"
         for name in one_sided
-        if values.get(name, 0.0) < -LOAD_STATE.force_rounding
+        if values.get(name, 0.0) < -FORCE_ROUNDING
     ]
     if state.slack:
         # The residual acts on the tibia. The moment of a knee without contact acts on the femur.
         extension = values.get("residual_flexion", 0.0) - values.get("knee_moment_flexion", 0.0)
-        if extension > LOAD_STATE.patella_moment:
+        if extension > PATELLA_MOMENT:
             wrong.append(f"extension moment {extension:.3g} N·m needed")
     return wrong
 
@@ -312,7 +296,7 @@ def contradictions(
     if state.slack:
         taut = solutions[LoadState(state.lifted, frozenset())].values
         pulls = {name: taut[name] for name in (*_muscles(taut), "patellar_ligament")}
-        if not min(pulls.values()) < -LOAD_STATE.force_rounding:
+        if not min(pulls.values()) < -FORCE_ROUNDING:
             name, pull = next(iter(pulls.items()))
             wrong.append(f"{name.removeprefix(MUSCLE)} would pull with {pull:.3g} N")
     for side in sorted(state.lifted - lifted_by_gap):

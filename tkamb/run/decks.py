@@ -35,15 +35,9 @@ if TYPE_CHECKING:
     from tkamb.run.frame_press import PressProblem
 
 
-@dataclass(frozen=True)
-class CalculixDeckSettings:
-    """Numbers of a deck for CalculiX."""
+# N/mm³: contact stiffness. Chosen because the penetration is then 0.3 µm at 30 MPa.
+PENALTY = 1e5
 
-    penalty: float = 1e5
-    """N/mm³: contact stiffness. Chosen because the penetration is then 0.3 µm at 30 MPa."""
-
-
-CALCULIX_DECK = CalculixDeckSettings()
 
 PATCH_THICKNESS = np.array([0.0, 1e-3, 0.0])
 """m: thickness of the layer of wedges that models the rigid femoral component."""
@@ -124,7 +118,7 @@ class Deck:
             "*SOLID SECTION, ELSET=FEMUR, MATERIAL=STEEL",
             f"*RIGID BODY, NSET=NFEMUR, REF NODE={self._centre}, ROT NODE={self._centre + 1}",
             *("*SURFACE INTERACTION, NAME=SI", "*SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE=LINEAR"),
-            f"{CALCULIX_DECK.penalty},0.001",
+            f"{PENALTY},0.001",
             "*CONTACT PAIR, INTERACTION=SI, TYPE=NODE TO SURFACE",
             "SLAVE,MASTER",
         ]
@@ -161,15 +155,9 @@ def _set(name: str, nodes: Index) -> list[str]:
     return [f"*NSET, NSET={name}", *(str(v + 1) for v in nodes)]
 
 
-@dataclass(frozen=True)
-class FebioDeckSettings:
-    """Numbers of a deck for FEBio."""
+# 1: steps of the displacement. FEBio divides a step that fails.
+LOAD_STEPS = 10
 
-    load_steps: int = 10
-    """1: steps of the displacement. FEBio divides a step that fails."""
-
-
-FEBIO_DECK = FebioDeckSettings()
 
 FIXED = ("Rx", "Rz", "Ru", "Rv", "Rw")
 """Constrained degrees of freedom of the femoral component: it moves along y only."""
@@ -224,8 +212,8 @@ def _control(root: Element) -> None:
         root,
         "Control",
         analysis="STATIC",
-        time_steps=FEBIO_DECK.load_steps,
-        step_size=1 / FEBIO_DECK.load_steps,
+        time_steps=LOAD_STEPS,
+        step_size=1 / LOAD_STEPS,
     )
     solver = SubElement(control, "solver", type="solid")
     for name, value in (
@@ -238,7 +226,7 @@ def _control(root: Element) -> None:
     for name, value in (
         ("max_retries", 10),
         ("dtmin", 0.001),
-        ("dtmax", 1 / FEBIO_DECK.load_steps),
+        ("dtmax", 1 / LOAD_STEPS),
     ):
         SubElement(stepper, name).text = str(value)
 

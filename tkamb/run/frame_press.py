@@ -30,20 +30,12 @@ from tkamb.run.results import Results
 from tkamb.run.results_folder import SUMMARY_NAME, read_results
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
-
-@dataclass(frozen=True)
-class DeckSettings:
-    """The parts of insert and femoral component that can touch in a deck."""
-
-    touchable_depths: float = 2.0
-    """1: nodes with a gap at first touch below this multiple of the guessed depth can touch.
-    Chosen because the error of the guess is smaller."""
-    largest_normal_y: float = -0.3
-    """1: largest y component of the normal of a femoral face in the patch. Chosen because steeper
-    faces do not press on the insert."""
-
-
-DECK = DeckSettings()
+# 1: nodes with a gap at first touch below this multiple of the guessed depth can touch. Chosen
+# because the error of the guess is smaller.
+TOUCHABLE_DEPTHS = 2.0
+# 1: largest y component of the normal of a femoral face in the patch. Chosen because steeper faces
+# do not press on the insert.
+LARGEST_NORMAL_Y = -0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +90,7 @@ def press_problem(pair: ContactPair, load: float, pose: Array, grid_mm: float) -
     if not depth > 0:
         raise ComputationError("needs a load that presses the bodies together", "deck")
     places, _ = floor.over(surface.points, pair.pose_at_approach(pose, 0.0))
-    near = places[:, 1] - surface.points[:, 1] < DECK.touchable_depths * depth
+    near = places[:, 1] - surface.points[:, 1] < TOUCHABLE_DEPTHS * depth
     pressed_pose = pair.pose_at_approach(pose, depth)
     patch = _patch(pair.femoral.moved(pressed_pose), surface.points[near], grid_mm * MILLIMETRE)
     lattice = replace(lattice, nodes=smooth)
@@ -109,7 +101,7 @@ def press_problem(pair: ContactPair, load: float, pose: Array, grid_mm: float) -
 
 def _patch(femoral: Surface, points: Array, spacing: float) -> Surface:
     """Return the downward triangles within one cell of any of the points, seen from above."""
-    down = np.flatnonzero(femoral.face_normals[:, 1] < DECK.largest_normal_y)
+    down = np.flatnonzero(femoral.face_normals[:, 1] < LARGEST_NORMAL_Y)
     middle = femoral.triangles[down].mean(axis=1)[:, ::2]
     away, _ = cKDTree(points[:, ::2]).query(middle, distance_upper_bound=spacing)
     used, faces = np.unique(femoral.faces[down[np.isfinite(away)]], return_inverse=True)

@@ -26,25 +26,19 @@ if TYPE_CHECKING:
 STORED = Path(__file__).with_name("known_errors.json")
 
 
-@dataclass(frozen=True)
-class KnownErrorSettings:
-    """How known errors of the contact settings are shown."""
+# 1: relative error above which a known error is coloured. Chosen because such an error may change
+# a conclusion.
+NOTABLE_SHARE = 0.10
+# Smallest number of pairs of bodies behind a stated error. Measured: in subsets of three, the
+# largest error had to be doubled to cover 95 % of the others.
+LEAST_PAIRS = 4
+# 1: largest sag of the facets over the approach. Measured: a ball of facets of 10 by 5 deg has
+# 0.42; its approach was 29 % too small, and its peak pressure that of a fine mesh.
+MOST_SAG = 0.45
+# m: distance from the loaded points within which facets count. Chosen: half the width of the
+# widest facets of 10 deg.
+FACET_REACH = 2.0 * MILLIMETRE
 
-    notable_share: float = 0.10
-    """1: relative error above which a known error is coloured. Chosen because such an error may
-    change a conclusion."""
-    least_pairs: int = 4
-    """Smallest number of pairs of bodies behind a stated error. Measured: in subsets of three, the
-    largest error had to be doubled to cover 95 % of the others."""
-    most_sag: float = 0.45
-    """1: largest sag of the facets over the approach. Measured: a ball of facets of 10 by 5 deg has
-    0.42; its approach was 29 % too small, and its peak pressure that of a fine mesh."""
-    facet_reach: float = 2.0 * MILLIMETRE
-    """m: distance from the loaded points within which facets count. Chosen: half the width of the
-    widest facets of 10 deg."""
-
-
-KNOWN_ERROR = KnownErrorSettings()
 
 NOT_MEASURED = "not measured"
 SAME_ANSWER = ("cache",)
@@ -111,8 +105,8 @@ class ContactSituation:
         if len(points):
             # Facets of several millimetres have few edges within a contact.
             on_femur = transform(inverse(result.pose), points)
-            sag += pair.femoral.facet_sag(on_femur, KNOWN_ERROR.facet_reach)
-            sag += pair.insert.facet_sag(points, KNOWN_ERROR.facet_reach)
+            sag += pair.femoral.facet_sag(on_femur, FACET_REACH)
+            sag += pair.insert.facet_sag(points, FACET_REACH)
         return cls(
             result.flags,
             tuple(condyle.thickness_over_radius for condyle in loaded),
@@ -203,17 +197,17 @@ def _outside(error: KnownError, contact: ContactSituation) -> str:
     # only where contact is modelled
     from tkamb.contact.flags import unmeasured_flags
 
-    if error.pairs < KNOWN_ERROR.least_pairs:
+    if error.pairs < LEAST_PAIRS:
         return f"only {error.pairs} pairs of bodies were measured"
     if not error.range:
         return "the range of the measured pairs is not known"
     # A status holds several flags.
     if flags := unmeasured_flags(flag for status in contact.flags for flag in status.split("; ")):
         return flags[0].split(": ")[0]
-    if contact.sag > KNOWN_ERROR.most_sag:
+    if contact.sag > MOST_SAG:
         return (
             f"the sag of the facets is {contact.sag:.2g} of the approach, at most "
-            f"{KNOWN_ERROR.most_sag:g} was measured"
+            f"{MOST_SAG:g} was measured"
         )
     values = {"thickness_over_radius": contact.thickness_over_radius}
     values["poisson_ratio"] = (contact.poisson_ratio,)
@@ -325,6 +319,4 @@ def is_large(error: Mapping[str, Any] | str, names: Iterable[str]) -> bool:
         return False
     situations = error.get("situations") or {}
     smooth = [errors for place, errors in situations.items() if place != "edge"]
-    return any(
-        errors[name] > KNOWN_ERROR.notable_share for name in names for errors in smooth or [error]
-    )
+    return any(errors[name] > NOTABLE_SHARE for name in names for errors in smooth or [error])

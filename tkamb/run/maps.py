@@ -42,16 +42,9 @@ SHARE_OF_MEMORY = 0.25
 """1: largest size of a whole array as a share of the available memory. Not studied."""
 
 
-@dataclass(frozen=True)
-class MapWriteSettings:
-    """How pressure maps are written."""
-
-    buffer_bytes: float = 4e6
-    """bytes: size of the maps that are collected for one write. Chosen because a write takes
-    as long as the maps of a frame."""
-
-
-MAP_WRITE = MapWriteSettings()
+# bytes: size of the maps that are collected for one write. Chosen because a write takes as long as
+# the maps of a frame.
+BUFFER_BYTES = 4e6
 
 
 class MapWriter:
@@ -146,7 +139,7 @@ class MapWriter:
             for value, shape in zip(values, shapes, strict=True)
         )
         self._waiting.append(frame)
-        if len(self._waiting) * sum(values.nbytes for values in frame) > MAP_WRITE.buffer_bytes:
+        if len(self._waiting) * sum(values.nbytes for values in frame) > BUFFER_BYTES:
             self.flush()
 
     def flush(self) -> None:

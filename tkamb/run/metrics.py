@@ -15,22 +15,15 @@ if TYPE_CHECKING:
     from tkamb.run.results import Results
 
 
-@dataclass(frozen=True)
-class MetricSettings:
-    """Limits of a jump of the centre of pressure, and of an unloaded quadriceps."""
-
-    jump: float = 8.0 * MILLIMETRE
-    """m: least travel of a centre of pressure in a frame that counts as a jump. Chosen because a
-    contact point on one dish moves less in a frame."""
-    jump_steps: float = 5.0
-    """1: a jump is also larger than this multiple of the median travel. Chosen because no movement
-    accelerates as much."""
-    least_tension: float = 1.0
-    """N: quadriceps tension below which ratios to it are not shown. Chosen because ratios of small
-    numbers are meaningless."""
-
-
-METRICS = MetricSettings()
+# m: least travel of a centre of pressure in a frame that counts as a jump. Chosen because a
+# contact point on one dish moves less in a frame.
+JUMP = 8.0 * MILLIMETRE
+# 1: a jump is also larger than this multiple of the median travel. Chosen because no movement
+# accelerates as much.
+JUMP_STEPS = 5.0
+# N: quadriceps tension below which ratios to it are not shown. Chosen because ratios of small
+# numbers are meaningless.
+LEAST_TENSION = 1.0
 
 
 @dataclass(frozen=True)
@@ -139,7 +132,7 @@ def tension_ratio(results: "Results", column: str) -> Array:
     """Return a force (f,) relative to the quadriceps tension."""
     quadriceps = results["quadriceps_N"]
     with np.errstate(invalid="ignore"):
-        taut = np.where(quadriceps > METRICS.least_tension, quadriceps, np.nan)
+        taut = np.where(quadriceps > LEAST_TENSION, quadriceps, np.nan)
     return results[column] / taut
 
 
@@ -193,9 +186,7 @@ def stretches(points: Array) -> list[slice]:
     """Return the parts of a path (n, k), m, without NaN and jumps, of two points or more."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     finite = steps[np.isfinite(steps)]
-    longest = (
-        max(METRICS.jump, METRICS.jump_steps * float(np.median(finite))) if len(finite) else 0.0
-    )
+    longest = max(JUMP, JUMP_STEPS * float(np.median(finite))) if len(finite) else 0.0
     near = np.concatenate([[False], steps <= longest, [False]])
     ends = np.flatnonzero(np.diff(near.astype(int))).reshape(-1, 2)
     return [slice(int(first), int(last) + 1) for first, last in ends]

@@ -47,28 +47,21 @@ from tkamb.run.known_errors import (
 )
 from tkamb.units import DEGREE, LENGTH, MEGAPASCAL, MILLIMETRE
 
+# N: largest load. Chosen because it exceeds a hundred body weights.
+MAX_LOAD = 1e5
+# rad: largest rotation of the femoral component about the vertical without a note. Chosen because
+# no knee rotates farther.
+MAX_TURN = 30.0 * DEGREE
+# rad: range of flexion in which the component is upside down. The flexion is estimated from the
+# shape, with an error of 10 deg. Chosen because no knee flexes beyond 160 deg.
+UPSIDE_DOWN = (170.0 * DEGREE, 250.0 * DEGREE)
+# rad: flexion below which the flange faces the insert and a note is given. Chosen because no knee
+# extends as far.
+MIN_FLEXION = -60.0 * DEGREE
+# rad: largest angle of the component's medial-lateral axis from the horizontal. Chosen because no
+# knee tilts as far.
+MAX_TILT = 45.0 * DEGREE
 
-@dataclass(frozen=True)
-class PressLimitSettings:
-    """Limits of loads and poses of a press."""
-
-    max_load: float = 1e5
-    """N: largest load. Chosen because it exceeds a hundred body weights."""
-    max_turn: float = 30.0 * DEGREE
-    """rad: largest rotation of the femoral component about the vertical without a note. Chosen
-    because no knee rotates farther."""
-    upside_down: tuple[float, float] = (170.0 * DEGREE, 250.0 * DEGREE)
-    """rad: range of flexion in which the component is upside down. The flexion is estimated from
-    the shape, with an error of 10 deg. Chosen because no knee flexes beyond 160 deg."""
-    min_flexion: float = -60.0 * DEGREE
-    """rad: flexion below which the flange faces the insert and a note is given. Chosen because no
-    knee extends as far."""
-    max_tilt: float = 45.0 * DEGREE
-    """rad: largest angle of the component's medial-lateral axis from the horizontal. Chosen because
-    no knee tilts as far."""
-
-
-PRESS_LIMITS = PressLimitSettings()
 
 Side = Literal["right", "left"]
 
@@ -205,7 +198,7 @@ def _naming_remarks(pair: ContactPair, pose: Array) -> list[str]:
     """Return notes on poses for which the names medial and lateral are doubtful."""
     shape = orientation(pair.femoral, pose)
     remarks = []
-    if shape is not None and shape.flexion < PRESS_LIMITS.min_flexion:
+    if shape is not None and shape.flexion < MIN_FLEXION:
         remarks.append(
             "the flange of the femoral component, not its condyles, faces the insert: check the "
             "axes and the pose"
@@ -220,7 +213,7 @@ def _naming_remarks(pair: ContactPair, pose: Array) -> list[str]:
             "the femoral component has one condyle: its contact is called medial",
         ]
     turn = abs(math.atan2(pose[0, 2], pose[2, 2]))
-    if turn <= PRESS_LIMITS.max_turn:
+    if turn <= MAX_TURN:
         return remarks
     return [
         *remarks,
@@ -234,8 +227,8 @@ def _check_orientation(femoral: Surface, pose: Array, path: str | Path) -> None:
     shape = orientation(femoral, pose)
     if shape is None:
         return
-    lowest, highest = PRESS_LIMITS.upside_down
-    if shape.tilt > PRESS_LIMITS.max_tilt:
+    lowest, highest = UPSIDE_DOWN
+    if shape.tilt > MAX_TILT:
         fault = "the femoral component lies on its side: its bone side does not open upward"
     elif lowest < shape.flexion % (2 * math.pi) < highest:
         fault = "the femoral component stands upside down: its bone side faces the insert"
@@ -358,8 +351,8 @@ def press_meshes(
 
 def _check_load(load: float) -> None:
     check_load(load)
-    if load > PRESS_LIMITS.max_load:
-        most = f"give the force in N, at most {PRESS_LIMITS.max_load:,.0f} N"
+    if load > MAX_LOAD:
+        most = f"give the force in N, at most {MAX_LOAD:,.0f} N"
         raise InputError(f"{load:g} N is more than any knee carries", "load", most)
 
 

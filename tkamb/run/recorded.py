@@ -1,7 +1,6 @@
 """Comparison of a run with measured forces and EMG."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,19 +20,12 @@ LAGS = np.arange(-40, 41) * 0.005
 """s: lags of the cross-correlation."""
 
 
-@dataclass(frozen=True)
-class ComparisonSettings:
-    """Comparison of predicted and measured time series."""
-
-    least_correlation_rise: float = 1e-6
-    """1: least difference between the largest correlation and those at the first and last lag.
-    With a smaller difference no lag is given. Chosen because rounding errors are smaller."""
-    fewest_frames: int = 8
-    """1: least number of frames for correlation and lag. Chosen because a correlation of fewer
-    values means little."""
-
-
-COMPARISON = ComparisonSettings()
+# 1: least difference between the largest correlation and those at the first and last lag. With a
+# smaller difference no lag is given. Chosen because rounding errors are smaller.
+LEAST_CORRELATION_RISE = 1e-6
+# 1: least number of frames for correlation and lag. Chosen because a correlation of fewer values
+# means little.
+FEWEST_FRAMES = 8
 
 
 def recorded_row(case: Case, k: int) -> dict[str, float]:
@@ -202,7 +194,7 @@ def _pearson(a: Array, b: Array) -> float:
 
 def _correlations(a: Array, rows: Array) -> Array:
     """Return Pearson's r (m,) of a (n,) and each row (m, n); NaN as in `_pearson`."""
-    if len(a) < COMPARISON.fewest_frames:
+    if len(a) < FEWEST_FRAMES:
         return np.full(len(rows), np.nan)
     varied = (np.ptp(rows, axis=1) > 0.0) & (np.ptp(a) > 0.0)
     deviation, deviations = a - a.mean(), rows - rows.mean(axis=1, keepdims=True)
@@ -215,7 +207,7 @@ def _lag(envelopes: "Envelopes", muscle: str, time: Array, activation: Array) ->
     shifted = envelopes.at(muscle, time - LAGS[:, None])
     finite = np.isfinite(shifted).all(axis=0)
     r = _correlations(activation[finite], shifted[:, finite])
-    if not r.max() > max(r[0], r[-1]) + COMPARISON.least_correlation_rise:  # NaN too
+    if not r.max() > max(r[0], r[-1]) + LEAST_CORRELATION_RISE:  # NaN too
         return np.nan
     return float(LAGS[r.argmax()])
 

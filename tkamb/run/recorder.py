@@ -206,19 +206,11 @@ def check_same_run(
 MAPS = ("pressure", "gap", "nodal_force", "pose", *CONTACT_PLACES)
 
 
-@dataclass(frozen=True)
-class RecorderSettings:
-    """How often the results of the finished frames are written."""
-
-    shortest_pause_seconds: float = 1.0
-    """s: least time before the first and between later copies of the results. Chosen so that the
-    results of a killed run lack few frames."""
-    largest_time_share: float = 0.02
-    """1: largest share of the computing time for these copies. Chosen because it is not
-    noticeable."""
-
-
-RECORDER = RecorderSettings()
+# s: least time before the first and between later copies of the results. Chosen so that the
+# results of a killed run lack few frames.
+SHORTEST_PAUSE_SECONDS = 1.0
+# 1: largest share of the computing time for these copies. Chosen because it is not noticeable.
+LARGEST_TIME_SHARE = 0.02
 
 
 class Recorder:
@@ -317,7 +309,7 @@ class FolderRecorder(Recorder):
         self._directory = directory
         self._shards = Shards(directory, identity, resume)
         self._maps_path = self._shards.folder / MAPS_NAME
-        self._pause, self._published_at = RECORDER.shortest_pause_seconds, clock.perf_counter()
+        self._pause, self._published_at = SHORTEST_PAUSE_SECONDS, clock.perf_counter()
         self._map_arguments: tuple[Any, ...] | None = None
 
     def begin_maps(self, points: Array, triangles: Array, labels: Mapping[str, Any]) -> None:
@@ -377,7 +369,7 @@ class FolderRecorder(Recorder):
             files.remove(REPORT_NAME)
         self._published_at = clock.perf_counter()
         seconds = self._published_at - start
-        self._pause = max(RECORDER.shortest_pause_seconds, seconds / RECORDER.largest_time_share)
+        self._pause = max(SHORTEST_PAUSE_SECONDS, seconds / LARGEST_TIME_SHARE)
         return results
 
 

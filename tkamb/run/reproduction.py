@@ -17,7 +17,7 @@ import numpy as np
 
 from tkamb import __version__, code_identity
 from tkamb.errors import InputError
-from tkamb.files import FILE_LIMITS, check_replaced, sha256_of
+from tkamb.files import MESH_BYTES, check_replaced, sha256_of
 from tkamb.run.columns import KINDS
 from tkamb.run.identity import CONTACT_CODE, contact_code, overrides_of_run, preset_of_run
 from tkamb.run.results_folder import (
@@ -108,7 +108,7 @@ def _input(path: Path, recorded: str) -> str | None:
     """Return a message on an input file; None: it has not changed."""
     path = Path(os.path.normpath(path))
     try:
-        same = sha256_of(path, FILE_LIMITS.mesh_bytes) == recorded  # the limit of input files
+        same = sha256_of(path, MESH_BYTES) == recorded  # the limit of input files
     except InputError as error:
         return f"input {error}"
     return None if same else f"input {path} has changed since it was read"

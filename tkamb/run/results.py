@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tkamb.errors import InputError, names_near, not_installed
-from tkamb.files import FILE_LIMITS, open_regular, undamaged
+from tkamb.files import TABLE_BYTES, open_regular, undamaged
 from tkamb.geometry.frames import Array
 from tkamb.run.columns import KINDS, RENAMED, in_a_family, ordered_names
 
@@ -26,18 +26,11 @@ PERCENTILES = {"p05": 5.0, "p50": 50.0, "p95": 95.0}
 """Suffix of a column of bands.csv -> percentile of the samples, per cent."""
 
 
-@dataclass(frozen=True)
-class StatisticsSettings:
-    """Conditions for a band of samples."""
-
-    min_samples: int = 20
-    """1: least number of samples. Chosen because the 5th percentile of 20 samples lies between the
-    two smallest."""
-    max_failed_share: float = 0.5
-    """1: largest share of failed samples. Chosen because a minority is not representative."""
-
-
-STATISTICS_LIMITS = StatisticsSettings()
+# 1: least number of samples. Chosen because the 5th percentile of 20 samples lies between the two
+# smallest.
+MIN_SAMPLES = 20
+# 1: largest share of failed samples. Chosen because a minority is not representative.
+MAX_FAILED_SHARE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,9 +117,9 @@ class Results:
 
     def why_no_band(self, frame: int) -> str:
         """Return why a frame has no band."""
-        if self.bands["failed_share"][frame] > STATISTICS_LIMITS.max_failed_share:
+        if self.bands["failed_share"][frame] > MAX_FAILED_SHARE:
             return "more than half of the samples failed"
-        return f"fewer than {STATISTICS_LIMITS.min_samples} samples have it, use more"
+        return f"fewer than {MIN_SAMPLES} samples have it, use more"
 
     def to_dataframe(self) -> "DataFrame":
         """Return the columns as a pandas DataFrame with frames as rows.
@@ -189,7 +182,7 @@ def _read_columns(path: Path) -> dict[str, Any]:
 
     The rows are read one by one, so that their text is never in memory as a whole.
     """
-    descriptor = open_regular(path, FILE_LIMITS.table_bytes)
+    descriptor = open_regular(path, TABLE_BYTES)
     with undamaged(path), open(descriptor, encoding="utf-8", newline="") as file:
         rows = csv.reader(file)
         header = [RENAMED.get(name, name) for name in next(rows, ())]

@@ -33,19 +33,12 @@ if TYPE_CHECKING:
     from tkamb.knee.slip import CondyleSlip
 
 
-@dataclass(frozen=True)
-class FrameLoopSettings:
-    """How frames are distributed over workers, and initial guesses from earlier frames."""
-
-    kept_contacts: int = 20
-    """1: number of earlier contacts that are stored as initial guesses. Chosen because older ones
-    are no better than a new search."""
-    frames_per_chunk: int = 10
-    """1: successive frames that a worker computes. The first has no initial guess from an earlier
-    frame. Chosen independent of the number of workers, so that it does not affect results."""
-
-
-FRAME_LOOP = FrameLoopSettings()
+# 1: number of earlier contacts that are stored as initial guesses. Chosen because older ones are
+# no better than a new search.
+KEPT_CONTACTS = 20
+# 1: successive frames that a worker computes. The first has no initial guess from an earlier
+# frame. Chosen independent of the number of workers, so that it does not affect results.
+FRAMES_PER_CHUNK = 10
 
 
 Finished = tuple[int, Row, dict[str, Array] | None]
@@ -95,7 +88,7 @@ class FrameSolver:
         if frame.contact is not None:
             self.before = [replace(each, contact=None) for each in self.before]
         self.before.append(frame.next)
-        del self.before[: -FRAME_LOOP.kept_contacts]
+        del self.before[:-KEPT_CONTACTS]
 
 
 Chunk = tuple[list[int], "dict[str, CondyleSlip]"]
@@ -149,7 +142,7 @@ def finished_in_order(
     """
     chunks: dict[int, Chunk] = {}
     for k in remaining:
-        chunks.setdefault(indices.index(k) // FRAME_LOOP.frames_per_chunk, ([], slips))[0].append(k)
+        chunks.setdefault(indices.index(k) // FRAMES_PER_CHUNK, ([], slips))[0].append(k)
     early: dict[int, list[Finished]] = {}
     order = iter(chunks)
     expected: Any = next(order, None)
@@ -235,7 +228,7 @@ def simulate(
     path = None if scene_path is None else Path(scene_path)
     run = _Run(case, indices, identity, input_hashes(case, path), path, start)
     with ExitStack() as stack:
-        team, chunks = None, math.ceil(len(indices) / FRAME_LOOP.frames_per_chunk)
+        team, chunks = None, math.ceil(len(indices) / FRAMES_PER_CHUNK)
         if min(workers, chunks) > 1:
             task = Task(ChunkSolver, (case.scene,))
             team = stack.enter_context(options.team(task, chunks))  # workers prepare meanwhile
@@ -343,7 +336,7 @@ class _Run:
     def _take_earlier(self) -> None:
         """Read the frames of the run to resume. Its last contacts become initial guesses."""
         earlier, recording = self.recorder.take_earlier(self.indices), self.solver.recording
-        last = list(earlier.items())[-FRAME_LOOP.kept_contacts :]
+        last = list(earlier.items())[-KEPT_CONTACTS:]
         self.solver.before = [recording.recalled(k, arrays) for k, arrays in last]
 
 

@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import lru_cache
 from importlib.metadata import version
@@ -13,7 +12,7 @@ import numpy as np
 
 from tkamb import __version__
 from tkamb.geometry.frames import SIDES
-from tkamb.io.recordings.gait_cycle import GAIT, cycle_percent
+from tkamb.io.recordings.gait_cycle import CONTACT_FORCE_N, cycle_percent
 from tkamb.io.scene.case import Case
 from tkamb.io.scene.scene import Scene
 from tkamb.io.scene.tables import ContactTable
@@ -44,19 +43,12 @@ RESIDUALS = (
 )
 
 
-@dataclass(frozen=True)
-class SummarySettings:
-    """Limits in the summary."""
-
-    notable_reserve: float = 0.05
-    """1: share of a coordinate's largest moment above which a reserve is counted as large. Chosen
-    because smaller reserves hardly change muscle forces."""
-    uneven_share: float = 0.01
-    """1: largest relative difference between longest and shortest time step of a motion with a
-    frame rate. Chosen because clocks and rounding cause smaller differences."""
-
-
-SUMMARY = SummarySettings()
+# 1: share of a coordinate's largest moment above which a reserve is counted as large. Chosen
+# because smaller reserves hardly change muscle forces.
+NOTABLE_RESERVE = 0.05
+# 1: largest relative difference between longest and shortest time step of a motion with a frame
+# rate. Chosen because clocks and rounding cause smaller differences.
+UNEVEN_SHARE = 0.01
 
 
 SATURATED = 0.99
@@ -144,7 +136,7 @@ def measures(case: Case, columns: Mapping[str, Any]) -> dict[str, Any]:
     time = case.motion.time
     result: dict[str, Any] = {}
     steps = np.diff(time)
-    if len(steps) and steps.max() < (1.0 + SUMMARY.uneven_share) * steps.min():
+    if len(steps) and steps.max() < (1.0 + UNEVEN_SHARE) * steps.min():
         result["frame_rate_Hz"] = float(1.0 / steps.mean())
     surfaces = {"femoral": case.femoral, "insert": case.insert, "patella": case.patella}
     result["meshes"] = {
@@ -208,7 +200,7 @@ def _gait(case: Case) -> dict[str, Any]:
         "foot_strike_s": gait.foot_strikes,
         "toe_off_s": gait.toe_offs,
         "stance_s": gait.spans(),
-        "threshold_N": GAIT.contact_force_N,
+        "threshold_N": CONTACT_FORCE_N,
         "toe_off_percent": [
             float(cycle_percent(np.array(off), cycle)) for off in toe_offs if cycle
         ],
@@ -340,7 +332,7 @@ def reserves(columns: Mapping[str, Any]) -> dict[str, dict[str, float]]:
         result[name] = {
             "largest_Nm": float(np.nanmax(reserve)),
             "percent_of_largest_moment": 100.0 * float(np.nanmax(reserve)) / largest,
-            "frames_above_5_percent": int((reserve > SUMMARY.notable_reserve * largest).sum()),
+            "frames_above_5_percent": int((reserve > NOTABLE_RESERVE * largest).sum()),
         }
     return result
 

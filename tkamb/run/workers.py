@@ -127,15 +127,9 @@ def _unpacked(packed: bytes) -> Callable[[int, Any], Any]:
     return prepared
 
 
-@dataclass(frozen=True)
-class WorkerLimitSettings:
-    """Limits of worker processes."""
+# 1: largest number of worker processes. Chosen because usual machines have fewer cores.
+MAX_WORKERS = 256
 
-    max_workers: int = 256
-    """1: largest number of worker processes. Chosen because usual machines have fewer cores."""
-
-
-WORKER_LIMITS = WorkerLimitSettings()
 
 Numbered = tuple[int, Any]
 Progress = Callable[[Iterable[Numbered], int], Iterable[Numbered]]
@@ -179,11 +173,11 @@ class PoolOptions:
     def __post_init__(self) -> None:
         if self.dask == LOCAL:
             object.__setattr__(self, "dask", None)
-        if not 1 <= self.workers <= WORKER_LIMITS.max_workers:
+        if not 1 <= self.workers <= MAX_WORKERS:
             raise InputError(
                 f"cannot be {self.workers}",
                 "workers",
-                f"give a number from 1 to {WORKER_LIMITS.max_workers}",
+                f"give a number from 1 to {MAX_WORKERS}",
             )
 
     def check(self) -> None:

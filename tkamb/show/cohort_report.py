@@ -1,7 +1,6 @@
 """The report of a cohort: one self-contained page that compares the groups."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -43,17 +42,10 @@ AT_ONCE = len(COLOURS)
 """Largest number of groups in one plot."""
 
 
-@dataclass(frozen=True)
-class CohortReportSettings:
-    """Limits of a cohort's page."""
-
-    most_maps: int = 24
-    """Largest number of pressure maps. Chosen because more make the page slow to open."""
-    most_failed: int = 100
-    """Largest number of failed runs in the list. Chosen because the page stays readable."""
-
-
-COHORT_REPORT = CohortReportSettings()
+# Largest number of pressure maps. Chosen because more make the page slow to open.
+MOST_MAPS = 24
+# Largest number of failed runs in the list. Chosen because the page stays readable.
+MOST_FAILED = 100
 
 
 def cohort_html(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Group]) -> str:
@@ -73,7 +65,7 @@ def cohort_html(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequenc
         designs=_designs(cohort, groups, outcomes),
         wear=_wear_table(groups),
         maps=_maps(cohort, outcomes, groups),
-        failed=_failed(cohort, outcomes)[: COHORT_REPORT.most_failed],
+        failed=_failed(cohort, outcomes)[:MOST_FAILED],
         failed_count=sum(bool(one.reason) for one in outcomes.values()),
     )
 
@@ -285,7 +277,7 @@ def _maps(
 ) -> dict[str, Any] | None:
     """Return one map of each group side by side on one scale; None without contact."""
     shown, alike = _typical(cohort, outcomes, groups)
-    with_map = shown[: COHORT_REPORT.most_maps]
+    with_map = shown[:MOST_MAPS]
     if not with_map:
         return None
     flexion = cohort.table.map_flexion_deg

@@ -22,16 +22,9 @@ if TYPE_CHECKING:
     from tkamb.run.results import Results
 
 
-@dataclass(frozen=True)
-class PairingSettings:
-    """Pairing of frames of two runs."""
-
-    tolerance: float = 1e-6
-    """deg, per cent or s: frames with a smaller distance on the axis are the same instant of one
-    recording. Chosen because it is above the rounding of files."""
-
-
-PAIRING = PairingSettings()
+# deg, per cent or s: frames with a smaller distance on the axis are the same instant of one
+# recording. Chosen because it is above the rounding of files.
+TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +93,7 @@ def _same_frames(
     paired = result >= 0
     if paired.sum() < min(len(first_time), len(other_time)):
         return None
-    near = np.abs(first_place[paired] - other_place[result[paired]]) <= PAIRING.tolerance
+    near = np.abs(first_place[paired] - other_place[result[paired]]) <= TOLERANCE
     return result if near.all() else None
 
 
@@ -119,15 +112,8 @@ VERSIONS = "identity"
 SAME = "Nothing differs: settings, input files, versions and code of the runs agree."
 
 
-@dataclass(frozen=True)
-class CompareSettings:
-    """Limit of a comparison."""
-
-    max_runs: int = 8
-    """Largest number of runs in a picture. Chosen because more colours are hard to distinguish."""
-
-
-COMPARE = CompareSettings()
+# Largest number of runs in a picture. Chosen because more colours are hard to distinguish.
+MAX_RUNS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,8 +217,8 @@ def compare_folders(folders: Sequence[str | Path], axis: str | None = None) -> C
         InputError: there are fewer than two or too many folders, a folder has no results, or the
             runs have different axes.
     """
-    if not 2 <= len(folders) <= COMPARE.max_runs:
-        what = f"needs two to {COMPARE.max_runs} folders of results, not {len(folders)}"
+    if not 2 <= len(folders) <= MAX_RUNS:
+        what = f"needs two to {MAX_RUNS} folders of results, not {len(folders)}"
         raise InputError(what, "compare", "name each folder that `tkamb run` wrote")
     paths = [Path(folder) for folder in folders]
     loaded = [read_results(path) for path in paths]

@@ -32,16 +32,9 @@ DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.2, 1.2, 1.2)))
 """Line styles: runs can be distinguished without colour, and where they coincide."""
 
 
-@dataclass(frozen=True)
-class CompareFigureSettings:
-    """Plots of compared runs."""
-
-    failed_row_height: float = 0.03
-    """1: distance between the rows of crosses that mark failed frames, as a share of the plot's
-    height. Each run has a row. Chosen by eye."""
-
-
-COMPARE_FIGURE = CompareFigureSettings()
+# 1: distance between the rows of crosses that mark failed frames, as a share of the plot's height.
+# Each run has a row. Chosen by eye.
+FAILED_ROW_HEIGHT = 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +120,7 @@ def _draw_curve(axes: Axes, number: int, run: Run, values: Array) -> None:
     marker = "o" if len(values) == 1 else ""  # a line of one point would be invisible
     axes.plot(x, y, color=colour, linestyle=dashes, gid=f"run-{number}", marker=marker)
     failures = failed(run.results)
-    height = np.full(int(failures.sum()), COMPARE_FIGURE.failed_row_height * (1 + number))
+    height = np.full(int(failures.sum()), FAILED_ROW_HEIGHT * (1 + number))
     axes.plot(
         run.axis.values[failures], height, "x", color=colour, markersize=5,
         transform=axes.get_xaxis_transform(), gid=f"failed-{number}",

@@ -1,11 +1,10 @@
 """Pressure maps of all frames as one grey picture, for the report's slider.
 
-A byte is `FRAME_MAP.rim_byte` at the edge of contact, larger in contact (255 for the largest
+A byte is `RIM_BYTE` at the edge of contact, larger in contact (255 for the largest
 pressure of the run) and smaller outside. The page interpolates linearly between the bytes and
 colours the contact.
 """
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,22 +25,15 @@ if TYPE_CHECKING:
     from tkamb.run.results import Results
 
 
-@dataclass(frozen=True)
-class FrameMapSettings:
-    """The pressure maps behind the report's frame slider."""
-
-    rim_byte: int = 64
-    """Byte at the edge of contact; larger bytes are pressure. Chosen because it leaves bytes for
-    the gaps outside contact, from which the page finds the edge between grid points."""
-    most_frames: int = 250
-    """Largest number of maps in the page. A longer run shows the map of the nearest frame at each
-    position of the slider. Chosen because it limits the size of the page."""
-    coarsening: int = 2
-    """Grid step of the slider's maps divided by the grid step of the report's still maps. Chosen
-    because the data are a quarter of the size."""
-
-
-FRAME_MAP = FrameMapSettings()
+# Byte at the edge of contact; larger bytes are pressure. Chosen because it leaves bytes for the
+# gaps outside contact, from which the page finds the edge between grid points.
+RIM_BYTE = 64
+# Largest number of maps in the page. A longer run shows the map of the nearest frame at each
+# position of the slider. Chosen because it limits the size of the page.
+MOST_FRAMES = 250
+# Grid step of the slider's maps divided by the grid step of the report's still maps. Chosen
+# because the data are a quarter of the size.
+COARSENING = 2
 
 
 def draw_insert(view: TopView, largest: float) -> Figure:
@@ -75,7 +67,7 @@ def frame_maps(results: "Results", view: TopView) -> dict[str, Any]:
         shown: for each frame, the frame in which the pressure of its tile was computed.
         edges: left, right, bottom and top of a tile, mm on the page.
         span: left, right, bottom and top of the drawn insert, mm on the page.
-        rim: `FRAME_MAP.rim_byte`.
+        rim: `RIM_BYTE`.
         largest: upper end of the colour scale, MPa.
         colours: the colour scale, 256 hexadecimal colours in one string.
         centres: side -> centre of pressure of each frame, mm on the page; None: no contact.
@@ -83,9 +75,7 @@ def frame_maps(results: "Results", view: TopView) -> dict[str, Any]:
     assert results.maps is not None
     rows = map_rows(results)
     frames = np.array(sorted(rows))
-    chosen = frames[
-        np.unique(np.linspace(0, len(frames) - 1, FRAME_MAP.most_frames).round().astype(int))
-    ]
+    chosen = frames[np.unique(np.linspace(0, len(frames) - 1, MOST_FRAMES).round().astype(int))]
     largest = largest_pressure(results) * MEGAPASCAL
     tiles, edges = _tiles(results, view, [rows[k] for k in chosen], largest)
     across = int(np.ceil(np.sqrt(len(chosen))))
@@ -101,7 +91,7 @@ def frame_maps(results: "Results", view: TopView) -> dict[str, Any]:
         "shown": [int(chosen[n]) for n in nearest],
         "edges": edges,
         "span": [first, right, bottom, top],
-        "rim": FRAME_MAP.rim_byte,
+        "rim": RIM_BYTE,
         "largest": largest / MEGAPASCAL,
         "colours": "".join(to_hex(one)[1:] for one in colormaps[PRESSURE_MAP](np.arange(256))),
         "centres": {side: _centres(results, view, side) for side in SIDES},
@@ -119,14 +109,12 @@ def _tiles(
     assert maps is not None
     pressure, gap = (maps.rows(name, rows) for name in ("pressure_Pa", "gap_m"))
     levels = pressure_levels(pressure, gap, view.triangles, largest)
-    result = view.grid.sample(levels, FRAME_MAP.coarsening)
+    result = view.grid.sample(levels, COARSENING)
     down, over = touched_part(result.max(axis=0) > 0)
-    steps = np.clip(
-        np.round(FRAME_MAP.rim_byte + (255 - FRAME_MAP.rim_byte) * result[:, down, over]), 0, 255
-    )
+    steps = np.clip(np.round(RIM_BYTE + (255 - RIM_BYTE) * result[:, down, over]), 0, 255)
     up, across = (
-        view.grid.up[:: FRAME_MAP.coarsening][down],
-        view.grid.across[:: FRAME_MAP.coarsening][over],
+        view.grid.up[::COARSENING][down],
+        view.grid.across[::COARSENING][over],
     )
     edges = [round(float(edge), 3) for edge in (across[0], across[-1], up[-1], up[0])]
     return steps.astype(np.uint8), edges

@@ -24,26 +24,20 @@ BANDED = {"force_total_N": "the total", "medial_force_N": "the medial force"}
 AXIS_NAMES = {"ap": "AP", "si": "SI", "ml": "ML"}
 
 
-@dataclass(frozen=True)
-class HeadlineSettings:
-    """Limits of the report's headline."""
+# Largest number of inputs in a sentence. Not studied.
+MOST_INPUTS = 2
+# Largest number of saturated muscles in a sentence. Not studied.
+MOST_MUSCLES = 4
+# 1: a larger share of failed samples is stated. Chosen because fewer failed samples hardly move
+# the 5th or 95th percentile.
+NOTABLE_FAILED_SHARE = 0.05
+# % of the SI contact force: smaller residuals count as none. Chosen because they are within the
+# tolerance of the equilibrium.
+RESIDUAL_PERCENT = 0.05
+# deg: if the quadriceps begins to wrap between frames farther apart than this, the flexion of both
+# is stated. Chosen because readers need this flexion to a few degrees.
+DISTANT_FRAMES_DEG = 5.0
 
-    most_inputs: int = 2
-    """Largest number of inputs in a sentence. Not studied."""
-    most_muscles: int = 4
-    """Largest number of saturated muscles in a sentence. Not studied."""
-    notable_failed_share: float = 0.05
-    """1: a larger share of failed samples is stated. Chosen because fewer failed samples hardly
-    move the 5th or 95th percentile."""
-    residual_percent: float = 0.05
-    """% of the SI contact force: smaller residuals count as none. Chosen because they are within
-    the tolerance of the equilibrium."""
-    distant_frames_deg: float = 5.0
-    """deg: if the quadriceps begins to wrap between frames farther apart than this, the flexion of
-    both is stated. Chosen because readers need this flexion to a few degrees."""
-
-
-HEADLINE = HeadlineSettings()
 
 OTHER_ERRORS = (
     "These are errors of the contact model alone: errors of load, pose, shape and material add to "
@@ -184,7 +178,7 @@ def _muscles(summary: Mapping[str, Any]) -> dict[str, Any] | None:
     if not reserves:
         return None
     hip = [v["percent_of_largest_moment"] for k, v in reserves.items() if k.startswith("hip")]
-    named = sorted(saturated, key=lambda name: -saturated[name])[: HEADLINE.most_muscles]
+    named = sorted(saturated, key=lambda name: -saturated[name])[:MOST_MUSCLES]
     return {
         "hip": max(hip, default=None),
         "saturated": ", ".join(f"{name} ({saturated[name]} frames)" for name in named),
@@ -209,7 +203,7 @@ def _band(results: "Results") -> dict[str, Any] | None:
             for name, words in BANDED.items()
             if _largest(table, name)
         ],
-        "many_failed": table["largest_failed_share"] > HEADLINE.notable_failed_share,
+        "many_failed": table["largest_failed_share"] > NOTABLE_FAILED_SHARE,
         "not_varied": ", ".join(name.replace("_", " ") for name in table["not_varied"]),
     }
 
@@ -226,9 +220,7 @@ def _with_band(results: "Results", name: str, frame: int, scale: float, digits: 
 def _largest(table: Mapping[str, Any], result: str) -> str:
     """Return the inputs with the largest shares of the variance of a result, in words."""
     shares = (table.get("shares_of_variance") or {}).get(result) or {}
-    first = [(name, share) for name, share in shares.items() if name != "rest"][
-        : HEADLINE.most_inputs
-    ]
+    first = [(name, share) for name, share in shares.items() if name != "rest"][:MOST_INPUTS]
     return ", ".join(f"{_plain(name)} ({share:.0%})" for name, share in first if share >= 0.01)
 
 
@@ -327,7 +319,7 @@ def _wraps_from(results: "Results", first: float) -> str:
     """
     flexion, wrap = results["flexion_deg"], results["quadriceps_wrap_deg"]
     last = max(flexion[(wrap == 0.0) & (flexion < first)], default=first)
-    if first - last > HEADLINE.distant_frames_deg:
+    if first - last > DISTANT_FRAMES_DEG:
         return f"begins to wrap the femur between {last:.0f}° and {first:.0f}° of flexion"
     return f"wraps the femur from {first:.0f}° of flexion"
 
@@ -340,7 +332,7 @@ def _residuals(results: "Results") -> dict[str, Any] | None:
     largest = float(np.nanmax(share))
     change, axial = 100 * metrics.residual_effect(results), np.abs(results["residual_axial_Nm"])
     return {
-        "none": {"ap", "ml", "axial_rotation"} <= released and largest < HEADLINE.residual_percent,
+        "none": {"ap", "ml", "axial_rotation"} <= released and largest < RESIDUAL_PERCENT,
         "median": float(np.nanmedian(share)),
         "largest": largest,
         "change": float(np.nanmax(change)) if np.isfinite(change).any() else None,

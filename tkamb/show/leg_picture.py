@@ -36,24 +36,17 @@ from tkamb.show.style import (
 )  # fmt: skip
 from tkamb.units import DEGREE, MILLIMETRE
 
+# m per body weight: length of the force arrow. Chosen because it fits beside the leg.
+ARROW_METRES_PER_BW = 0.35
+# m: half width of the picture of the knee. Chosen because a total knee fits.
+KNEE_HALF_WIDTH = 0.085
+# m: margin around the leg or knee. Chosen because labels fit.
+MARGIN = 0.08
 
-@dataclass(frozen=True)
-class LegPictureSettings:
-    """Sizes in the picture of a leg."""
-
-    arrow_metres_per_BW: float = 0.35
-    """m per body weight: length of the force arrow. Chosen because it fits beside the leg."""
-    knee_half_width: float = 0.085
-    """m: half width of the picture of the knee. Chosen because a total knee fits."""
-    margin: float = 0.08
-    """m: margin around the leg or knee. Chosen because labels fit."""
-
-
-LEG_PICTURE = LegPictureSettings()
 
 LEGEND = (
     f"In the laboratory, y up, grid 0.1 m. Green arrow: force of the plate on the foot, 1 BW = "
-    f"{LEG_PICTURE.arrow_metres_per_BW:g} m.\nGrey: femoral component, light blue: insert and button; "  # noqa: E501
+    f"{ARROW_METRES_PER_BW:g} m.\nGrey: femoral component, light blue: insert and button; "
     "dark red: quadriceps, pink: patellar ligament, purple: ligaments."
 )
 
@@ -234,7 +227,7 @@ def _draw(axes: Axes, one: LegFrame, view: View, weight: float) -> None:
     for points, colour, _ in one.lines:
         axes.plot(*view.page(points).T, color=colour, linewidth=1.3)
     if one.force is not None and one.loaded:
-        tip = one.point + one.force / weight * LEG_PICTURE.arrow_metres_per_BW
+        tip = one.point + one.force / weight * ARROW_METRES_PER_BW
         arrow = {
             "arrowstyle": "-|>",
             "color": FORCE_COLOURS["ground reaction"],
@@ -248,7 +241,7 @@ def _draw(axes: Axes, one: LegFrame, view: View, weight: float) -> None:
     if one.force is not None:
         axes.axhline(one.point[1], color=GREY, linewidth=1)
     extent = view.page(np.concatenate(shown))
-    low, high = extent.min(axis=0) - LEG_PICTURE.margin, extent.max(axis=0) + LEG_PICTURE.margin
+    low, high = extent.min(axis=0) - MARGIN, extent.max(axis=0) + MARGIN
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     axes.set_aspect("equal", adjustable="box")
@@ -298,8 +291,8 @@ def _draw_surface(axes: Axes, surface: Surface, view: View, colour: str) -> None
 def _close_up(axes: Axes, one: LegFrame, view: View) -> None:
     """Limit the axes to the knee."""
     centre = view.page(one.joints[1]) + np.array([0.0, 15 * MILLIMETRE])
-    axes.set_xlim(centre[0] - LEG_PICTURE.knee_half_width, centre[0] + LEG_PICTURE.knee_half_width)
-    axes.set_ylim(centre[1] - LEG_PICTURE.knee_half_width, centre[1] + LEG_PICTURE.knee_half_width)
+    axes.set_xlim(centre[0] - KNEE_HALF_WIDTH, centre[0] + KNEE_HALF_WIDTH)
+    axes.set_ylim(centre[1] - KNEE_HALF_WIDTH, centre[1] + KNEE_HALF_WIDTH)
 
 
 def _same_limits(row: Array) -> None:

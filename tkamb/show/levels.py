@@ -1,6 +1,5 @@
 """Pressure maps as pictures: interpolation onto a grid, and the edge of contact."""
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -10,23 +9,15 @@ from tkamb.geometry.frames import Array, Mask
 from tkamb.geometry.topology import counted
 from tkamb.units import MILLIMETRE
 
-
-@dataclass(frozen=True)
-class LevelSettings:
-    """Conversion of a pressure map to a picture."""
-
-    edge_tolerance: float = 1e-9
-    """1: a grid point belongs to a triangle if no barycentric coordinate is below minus this.
-    Chosen because it is above rounding."""
-    largest_gap: float = 10 * MILLIMETRE
-    """m: upper limit of gaps, also of infinite ones. Chosen because it is far above the gaps
-    beside a contact."""
-    margin_points: int = 2
-    """Number of grid points around the contacts. Chosen because the edge of contact is then drawn
-    whole."""
-
-
-LEVELS = LevelSettings()
+# 1: a grid point belongs to a triangle if no barycentric coordinate is below minus this. Chosen
+# because it is above rounding.
+EDGE_TOLERANCE = 1e-9
+# m: upper limit of gaps, also of infinite ones. Chosen because it is far above the gaps beside a
+# contact.
+LARGEST_GAP = 10 * MILLIMETRE
+# Number of grid points around the contacts. Chosen because the edge of contact is then drawn
+# whole.
+MARGIN_POINTS = 2
 
 
 def pressure_levels(
@@ -46,9 +37,7 @@ def pressure_levels(
         peak: pressure of level 1, in the unit of `pressure`; higher pressures have level 1.
     """
     share = np.clip(np.nan_to_num(pressure) / (peak or 1.0), 0.0, 1.0)
-    apart = (
-        np.ones_like(share) if gap is None else np.clip(np.nan_to_num(gap), 0.0, LEVELS.largest_gap)
-    )
+    apart = np.ones_like(share) if gap is None else np.clip(np.nan_to_num(gap), 0.0, LARGEST_GAP)
     touched = triangles[share.max(axis=0)[triangles].any(axis=1)]  # only these have an edge
     return np.stack(
         [_frame_levels(one, far, touched) for one, far in zip(share, apart, strict=True)]
@@ -150,7 +139,7 @@ def touched_part(touched: Mask) -> tuple[slice, slice]:
 
 def _range(indices: NDArray[np.int64]) -> slice:
     low, high = (int(indices.min()), int(indices.max())) if len(indices) else (0, 1)
-    return slice(max(low - LEVELS.margin_points, 0), high + LEVELS.margin_points + 1)
+    return slice(max(low - MARGIN_POINTS, 0), high + MARGIN_POINTS + 1)
 
 
 def _covered(
@@ -164,8 +153,8 @@ def _covered(
         corners: corners (k, 3, 2) of the triangles, row and column, in steps of the grid.
         shape: number of rows and of columns of the grid.
     """
-    first = np.maximum(np.ceil(corners.min(axis=1) - LEVELS.edge_tolerance), 0.0).astype(np.int64)
-    last = np.minimum(np.floor(corners.max(axis=1) + LEVELS.edge_tolerance), np.array(shape) - 1)
+    first = np.maximum(np.ceil(corners.min(axis=1) - EDGE_TOLERANCE), 0.0).astype(np.int64)
+    last = np.minimum(np.floor(corners.max(axis=1) + EDGE_TOLERANCE), np.array(shape) - 1)
     size = np.maximum(last.astype(np.int64) - first + 1, 0)
     face, rank = counted(size.prod(axis=1))
     row, column = first[face, 0] + rank // size[face, 1], first[face, 1] + rank % size[face, 1]
@@ -174,7 +163,7 @@ def _covered(
     with np.errstate(divide="ignore", invalid="ignore"):  # a triangle seen edge-on has no area
         second, third = _area(a, point, c) / _area(a, b, c), _area(a, b, point) / _area(a, b, c)
     weights = np.stack([1.0 - second - third, second, third], axis=1)
-    inside = weights.min(axis=1) >= -LEVELS.edge_tolerance
+    inside = weights.min(axis=1) >= -EDGE_TOLERANCE
     return face[inside], (row * shape[1] + column)[inside], weights[inside]
 
 

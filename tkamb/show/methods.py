@@ -15,16 +15,8 @@ from tkamb.run import texts
 from tkamb.run.claims import compared_forces, method_error
 from tkamb.run.columns import WITHOUT_MUSCLES
 
-
-@dataclass(frozen=True)
-class MethodsTextSettings:
-    """Layout of the text of `tkamb methods`."""
-
-    line_width: int = 92
-    """Largest number of characters in a line. Chosen because terminals show it without breaks."""
-
-
-METHODS_TEXT = MethodsTextSettings()
+# Largest number of characters in a line. Chosen because terminals show it without breaks.
+LINE_WIDTH = 92
 
 
 REFERENCES = {
@@ -106,10 +98,9 @@ class Methods:
 
     def text(self) -> str:
         """Return the paragraph and its references as plain text."""
-        paragraph = textwrap.fill(" ".join(self.sentences), METHODS_TEXT.line_width)
+        paragraph = textwrap.fill(" ".join(self.sentences), LINE_WIDTH)
         cited = [
-            textwrap.fill(line, METHODS_TEXT.line_width, subsequent_indent="  ")
-            for line in self.references
+            textwrap.fill(line, LINE_WIDTH, subsequent_indent="  ") for line in self.references
         ]
         return "\n".join([paragraph, "", "References", *cited])
 

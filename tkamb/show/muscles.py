@@ -28,7 +28,15 @@ from tkamb.show.style import (
     new_figure,
     settings,
 )
-from tkamb.show.svg import LABEL_PLACE, label_width, leave_unmeasured, overhang, set_place
+from tkamb.show.svg import (
+    EDGE_POINTS,
+    TICK_LABEL_POINTS,
+    TICK_POINTS,
+    label_width,
+    leave_unmeasured,
+    overhang,
+    set_place,
+)
 
 if TYPE_CHECKING:
     from tkamb.run.results import Results
@@ -45,15 +53,9 @@ HELD = (
 )
 
 
-@dataclass(frozen=True)
-class MuscleFigureSettings:
-    """Plots of muscle activations."""
+# 1: upper end of the axis of activations. Chosen because lines at 1 stay visible.
+AXIS_TOP = 1.02
 
-    axis_top: float = 1.02
-    """1: upper end of the axis of activations. Chosen because lines at 1 stay visible."""
-
-
-MUSCLE_FIGURE = MuscleFigureSettings()
 
 CELL, CELLS_ACROSS, MARGIN = (2.16, 1.12), 5, 0.3
 """Width and height of a small plot, inches; number of plots in a row; height for labels, inches."""
@@ -177,10 +179,10 @@ def draw_activations(results: "Results", axis: HorizontalAxis) -> Figure | None:
             _draw_cell(axes, cell, results, axis)
             below = k + CELLS_ACROSS >= len(cells)
             axes.tick_params(labelbottom=below, labelleft=k % CELLS_ACROSS == 0)
-        first.set_ylim(0, MUSCLE_FIGURE.axis_top)
+        first.set_ylim(0, AXIS_TOP)
         first.set_yticks([0, 0.5, 1])
-        low = LABEL_PLACE.edge_points / 72 / figure.get_figheight()
-        figure.supxlabel(axis.label, fontsize=LABEL_PLACE.tick_label_points, y=low, va="bottom")
+        low = EDGE_POINTS / 72 / figure.get_figheight()
+        figure.supxlabel(axis.label, fontsize=TICK_LABEL_POINTS, y=low, va="bottom")
         _place_cells((first, *others), rows)
     return figure
 
@@ -188,13 +190,13 @@ def draw_activations(results: "Results", axis: HorizontalAxis) -> Figure | None:
 def _place_cells(cells: Sequence[Axes], rows: int) -> None:
     """Place the small plots in rows, with room for the labels around them."""
     width, height = 72 * CELLS_ACROSS * CELL[0], 72 * (rows * CELL[1] + MARGIN)
-    margin = LABEL_PLACE.edge_points + LABEL_PLACE.tick_points + label_width(cells[0].yaxis)
+    margin = EDGE_POINTS + TICK_POINTS + label_width(cells[0].yaxis)
     beyond = overhang(cells[0].xaxis, width / CELLS_ACROSS - margin)
     margin, right = (
-        max(margin, LABEL_PLACE.edge_points + beyond[0]),
-        LABEL_PLACE.edge_points + beyond[1],
+        max(margin, EDGE_POINTS + beyond[0]),
+        EDGE_POINTS + beyond[1],
     )
-    gap = max(BETWEEN[0], sum(beyond) + 2 * LABEL_PLACE.edge_points)
+    gap = max(BETWEEN[0], sum(beyond) + 2 * EDGE_POINTS)
     labels_within = LABELS if len(cells) % CELLS_ACROSS and rows > 1 else 0.0
     wide = (width - margin - right + gap) / CELLS_ACROSS - gap
     tall = (height - FOOT - TITLE - labels_within + BETWEEN[1]) / rows - BETWEEN[1]
@@ -227,7 +229,7 @@ def _beyond(results: "Results", cell: Cell) -> str:
         return ""
     envelope = results[family_column(ENVELOPE, cell.envelope)]
     largest = float(np.nan_to_num(envelope).max(initial=0.0))
-    return f"EMG to {largest:.2g}" if largest > MUSCLE_FIGURE.axis_top else ""
+    return f"EMG to {largest:.2g}" if largest > AXIS_TOP else ""
 
 
 def _agreement(results: "Results", cell: Cell) -> str:

@@ -36,16 +36,9 @@ if TYPE_CHECKING:
     from tkamb.run.results import Results
 
 
-@dataclass(frozen=True)
-class PanelSettings:
-    """Detection of curves that hide each other."""
-
-    line_width_share: float = 0.005
-    """1: two curves coincide if their largest distance is below this share of their height.
-    Chosen because a line is about 1.5 points wide in a plot of 220 points."""
-
-
-PANEL = PanelSettings()
+# 1: two curves coincide if their largest distance is below this share of their height. Chosen
+# because a line is about 1.5 points wide in a plot of 220 points.
+LINE_WIDTH_SHARE = 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +133,7 @@ def _coincide(values: Array, others: Array) -> bool:
         return False
     height = float(np.ptp(np.concatenate([values[finite], others[finite]])))
     distance = float(np.abs(values - others)[finite].max())
-    return distance <= PANEL.line_width_share * height
+    return distance <= LINE_WIDTH_SHARE * height
 
 
 def _line(

@@ -1,6 +1,5 @@
 """Line plots of a run, drawn in time order against flexion, cycle or time."""
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,7 +25,14 @@ from tkamb.show.style import (
     new_figure,
     settings,
 )
-from tkamb.show.svg import LABEL_PLACE, label_width, leave_unmeasured, set_place, text_width
+from tkamb.show.svg import (
+    EDGE_POINTS,
+    TICK_POINTS,
+    label_width,
+    leave_unmeasured,
+    set_place,
+    text_width,
+)
 
 if TYPE_CHECKING:
     from tkamb.run.results import Results
@@ -43,22 +49,15 @@ SIDE_LABEL, LEGEND = 8.0, 8.5
 """Points: font sizes of the labels beside a plot and of the legend."""
 
 
-@dataclass(frozen=True)
-class PlotSettings:
-    """Style of the report's plots."""
+# Points: distance of an axis label from the edge of the figure. Chosen by eye.
+LABEL_OFFSET_POINTS = 12.0
+# 1: gap between axes and the text beside them, as a share of the figure's width. Chosen by eye.
+SIDE_GAP = 0.01
+# 1: opacity of the band around a line, 0 to 1. Chosen by eye.
+BAND_OPACITY = 0.16
+# 1: opacity of the band that includes the discrepancy, 0 to 1. Chosen by eye.
+WIDE_BAND_OPACITY = 0.07
 
-    label_offset_points: float = 12.0
-    """Points: distance of an axis label from the edge of the figure. Chosen by eye."""
-    side_gap: float = 0.01
-    """1: gap between axes and the text beside them, as a share of the figure's width. Chosen by
-    eye."""
-    band_opacity: float = 0.16
-    """1: opacity of the band around a line, 0 to 1. Chosen by eye."""
-    wide_band_opacity: float = 0.07
-    """1: opacity of the band that includes the discrepancy, 0 to 1. Chosen by eye."""
-
-
-PLOT = PlotSettings()
 
 HANDLE, COLUMN_GAP = 2.7, 1.4
 """Width of a legend handle with its gap, and gap between columns, in font sizes of the legend."""
@@ -168,10 +167,7 @@ def _place_alone(axes: Axes, panel: Panel) -> bool:
     if any(side.get_major_formatter().get_offset() for side in sides):
         return False
     first, *others = (
-        LABEL_PLACE.edge_points
-        + LABEL_PLACE.tick_points
-        + width
-        + (AXIS_LABEL if side.get_label_text() else 0.0)
+        EDGE_POINTS + TICK_POINTS + width + (AXIS_LABEL if side.get_label_text() else 0.0)
         for side, width in zip(sides, widths, strict=True)
     )
     words = [one[-1] for one in (panel.level, panel.span) if one]
@@ -180,18 +176,16 @@ def _place_alone(axes: Axes, panel: Panel) -> bool:
     figure = axes.get_figure(root=True)
     assert figure is not None
     width, height = 72 * figure.get_size_inches()
-    right = max(LABEL_PLACE.edge_points + outside + PLOT.side_gap * width, OVERHANG, *others)
+    right = max(EDGE_POINTS + outside + SIDE_GAP * width, OVERHANG, *others)
     columns = _legend_columns(panel)
-    if _legend_width(panel, columns) > width - first - LABEL_PLACE.edge_points:
+    if _legend_width(panel, columns) > width - first - EDGE_POINTS:
         return False
     rows = -(-len(panel.lines) // columns)
-    top = LABEL_PLACE.edge_points + LEGEND * (1.0 + rows + 0.5 * (rows - 1))
+    top = EDGE_POINTS + LEGEND * (1.0 + rows + 0.5 * (rows - 1))
     wide, tall = width - first - right, height - FOOT - top
     set_place(axes, first, FOOT, wide, tall)
-    axes.xaxis.set_label_coords(0.5, (PLOT.label_offset_points - FOOT) / tall)
-    for side, place in zip(
-        sides, (PLOT.label_offset_points, width - PLOT.label_offset_points), strict=False
-    ):
+    axes.xaxis.set_label_coords(0.5, (LABEL_OFFSET_POINTS - FOOT) / tall)
+    for side, place in zip(sides, (LABEL_OFFSET_POINTS, width - LABEL_OFFSET_POINTS), strict=False):
         side.set_label_coords((place - first) / wide, 0.5, axes.transAxes)
     for axis in (axes.xaxis, *sides):
         leave_unmeasured(axis)
@@ -249,11 +243,11 @@ def _draw_band(axes: Axes, line: Line, axis: HorizontalAxis) -> None:
     """Shade a line's band from the 5th to the 95th percentile, and draw its median dotted."""
     assert line.band is not None
     (x, low), (_, middle), (_, high) = (axis.broken(one) for one in line.band)
-    opacity, name = PLOT.band_opacity, f"band-{line.name}"
+    opacity, name = BAND_OPACITY, f"band-{line.name}"
     axes.fill_between(x, low, high, color=line.colour, alpha=opacity, linewidth=0, gid=name)
     if line.wide_band is not None:
         (x_wide, least), (_, most) = (axis.broken(one) for one in line.wide_band)
-        pale, name = PLOT.wide_band_opacity, f"wide-band-{line.name}"
+        pale, name = WIDE_BAND_OPACITY, f"wide-band-{line.name}"
         axes.fill_between(x_wide, least, most, color=line.colour, alpha=pale, linewidth=0, gid=name)
     axes.plot(x, middle, color=line.colour, linestyle=":", linewidth=1, gid=f"median-{line.name}")
 

@@ -5,7 +5,6 @@ knee is mirrored at input and mirrored back in the picture.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -32,27 +31,20 @@ if TYPE_CHECKING:
     from tkamb.run.results import Results
 
 
-@dataclass(frozen=True)
-class PressurePictureSettings:
-    """Style of the pressure maps."""
+# mm: margin around the insert in a picture. Chosen by eye.
+MARGIN_MM = 2.0
+# mm: spacing of the grid on which pressures are drawn. Chosen because steps are then invisible.
+STEP_MM = 0.3
+# 1: share of the scale over which a map with small gradients fades at its rim. A steeper map fades
+# over one spacing of the grid. Chosen because steps are then invisible.
+RIM_SHARE = 0.03
+# Number of grid points around the insert within which its smooth outline lies. Chosen because
+# smoothing moves the outline by less.
+OUTLINE_MARGIN = 8
+# 1: standard deviation of the filter that smooths the outline, as a share of the map's edge
+# length. Chosen because 0.5 leaves steps visible and 1 rounds the notch.
+OUTLINE_WIDTH = 0.7
 
-    margin_mm: float = 2.0
-    """mm: margin around the insert in a picture. Chosen by eye."""
-    step_mm: float = 0.3
-    """mm: spacing of the grid on which pressures are drawn. Chosen because steps are then
-    invisible."""
-    rim_share: float = 0.03
-    """1: share of the scale over which a map with small gradients fades at its rim. A steeper map
-    fades over one spacing of the grid. Chosen because steps are then invisible."""
-    outline_margin: int = 8
-    """Number of grid points around the insert within which its smooth outline lies. Chosen because
-    smoothing moves the outline by less."""
-    outline_width: float = 0.7
-    """1: standard deviation of the filter that smooths the outline, as a share of the map's edge
-    length. Chosen because 0.5 leaves steps visible and 1 rounds the notch."""
-
-
-PRESSURE_PICTURE = PressurePictureSettings()
 
 LABEL_GAP_MM, LABEL_STEP_MM = 4.0, 2.6
 """mm: distance from a path to its labels, and between two labels."""
@@ -80,7 +72,7 @@ class TopView:
         self.across = self.sign * points[:, 2] / MILLIMETRE
         self.up = points[:, 0] / MILLIMETRE
         self.triangles = maps.triangles
-        self.grid = PageGrid(points, self.triangles, self.sign, PRESSURE_PICTURE.step_mm)
+        self.grid = PageGrid(points, self.triangles, self.sign, STEP_MM)
         self.grey = self.grid.sample(_shade(points, self.triangles))
 
     def page_coordinates(self, ap: Array, ml: Array) -> tuple[Array, Array]:
@@ -96,27 +88,23 @@ class TopView:
         """
         from scipy.ndimage import distance_transform_edt, gaussian_filter  # takes 0.1 s to load
 
-        grey = np.pad(self.grey, PRESSURE_PICTURE.outline_margin, constant_values=-1.0)
+        grey = np.pad(self.grey, OUTLINE_MARGIN, constant_values=-1.0)
         over = grey >= 0
         far, nearest = distance_transform_edt(~over, return_indices=True)
         signed = distance_transform_edt(over) - far
-        step = _edge_length_mm(self.points, self.triangles) / PRESSURE_PICTURE.step_mm
-        signed = gaussian_filter(signed, PRESSURE_PICTURE.outline_width * step)
+        step = _edge_length_mm(self.points, self.triangles) / STEP_MM
+        signed = gaussian_filter(signed, OUTLINE_WIDTH * step)
         return grey[tuple(nearest)], np.clip(0.5 + signed, 0.0, 1.0)
 
     @property
     def across_limits(self) -> tuple[float, float]:
         """Return the left and right end of the picture, mm."""
-        return float(self.across.min() - PRESSURE_PICTURE.margin_mm), float(
-            self.across.max() + PRESSURE_PICTURE.margin_mm
-        )
+        return float(self.across.min() - MARGIN_MM), float(self.across.max() + MARGIN_MM)
 
     @property
     def up_limits(self) -> tuple[float, float]:
         """Return the lower and upper end of the picture, mm."""
-        return float(self.up.min() - PRESSURE_PICTURE.margin_mm), float(
-            self.up.max() + PRESSURE_PICTURE.margin_mm
-        )
+        return float(self.up.min() - MARGIN_MM), float(self.up.max() + MARGIN_MM)
 
     def draw_insert(self, axes: Axes) -> None:
         """Draw the insert in greys that show its dishes, and set up the axes."""
@@ -124,7 +112,7 @@ class TopView:
         picture = colormaps["gray"](grey, bytes=True)
         picture[..., 3] = np.round(255 * opacity)
         left, right, low, high = self.grid.extent()
-        margin = PRESSURE_PICTURE.step_mm * PRESSURE_PICTURE.outline_margin
+        margin = STEP_MM * OUTLINE_MARGIN
         extent = (left - margin, right + margin, low - margin, high + margin)
         _show(axes, picture, extent, 1.0)
         axes.set_xlim(self.across_limits)
@@ -317,9 +305,7 @@ def draw_pressure(
         level = level[part]
         picture = colormaps[PRESSURE_MAP](np.maximum(level, 0.0), bytes=True)
         change = np.hypot(*np.gradient(level))  # change over one spacing of the grid
-        picture[..., 3] = 255 * np.clip(
-            0.5 + level / np.maximum(change, PRESSURE_PICTURE.rim_share), 0.0, 1.0
-        )
+        picture[..., 3] = 255 * np.clip(0.5 + level / np.maximum(change, RIM_SHARE), 0.0, 1.0)
         _show(axes, picture, view.grid.extent(*part), 1.5)
 
 

@@ -32,16 +32,9 @@ if TYPE_CHECKING:
 ANGLES = ("flexion", "adduction", "axial_rotation")
 
 
-@dataclass(frozen=True)
-class InventorySettings:
-    """Limits of the list that `tkamb check` prints."""
-
-    high_strain: float = 0.1
-    """1: ligament bundles with a larger strain are listed. Chosen because ligaments of the knee
-    rupture at 12 to 20 %."""
-
-
-INVENTORY = InventorySettings()
+# 1: ligament bundles with a larger strain are listed. Chosen because ligaments of the knee rupture
+# at 12 to 20 %.
+HIGH_STRAIN = 0.1
 
 
 @dataclass(frozen=True)
@@ -188,7 +181,7 @@ def _ligaments(recording: Recording) -> Entry:
         f"{name} {100 * value:.0f} % at {flexion:.0f} deg"
         for name, values in strains.items()
         for flexion, value in zip(STRAIN_FLEXIONS, values, strict=True)
-        if value > INVENTORY.high_strain
+        if value > HIGH_STRAIN
     ]
     text = f"{len(recording.ligaments)} bundles: {_listed([b.name for b in recording.ligaments])}"
     finite = np.array([v for values in strains.values() for v in values if np.isfinite(v)])

@@ -220,15 +220,9 @@ STRETCHES_SHOWN = 60
 WEAR_NAME, PICTURE_NAME, WORN_NAME = "wear.json", "wear.png", "wear.vtp"
 
 
-@dataclass(frozen=True)
-class WearPageSettings:
-    """Limits on files of wear results."""
+# Bytes: largest size of a file. Chosen because the file of 10,000 updates has 10 MB.
+MAX_BYTES = 64 * MEGABYTE
 
-    max_bytes: float = 64 * MEGABYTE
-    """Bytes: largest size of a file. Chosen because the file of 10,000 updates has 10 MB."""
-
-
-WEAR_PAGE = WearPageSettings()
 
 WEAR_ROWS = (
     ("worn volume, mm³", "volume_mm3"),
@@ -263,9 +257,7 @@ def wear_section(results: "Results") -> dict[str, Any] | None:
         return None
     if not result:
         return {"other": OTHER_WEAR}
-    picture = base64.b64encode(read_bytes(folder / PICTURE_NAME, WEAR_PAGE.max_bytes)).decode(
-        "ascii"
-    )
+    picture = base64.b64encode(read_bytes(folder / PICTURE_NAME, MAX_BYTES)).decode("ascii")
     try:
         return _wear_content(result, picture)
     except (KeyError, TypeError, ValueError, AttributeError):
@@ -315,7 +307,7 @@ def wear_of_run(results: "Results") -> dict[str, Any] | None:
     folder = results.directory
     if folder is None or not (folder / WEAR_NAME).is_file():
         return None
-    result = read_json(folder / WEAR_NAME, WEAR_PAGE.max_bytes, what="wear.json")
+    result = read_json(folder / WEAR_NAME, MAX_BYTES, what="wear.json")
     if not isinstance(result, dict) or not result.get("files_sha256"):
         return {}
     summary, scenes = results.summary, result.get("scene_sha256")

@@ -23,7 +23,7 @@ from tkamb.show.style import (
 from tkamb.studies.cohort.outcome import Outcome
 from tkamb.studies.cohort.plan import Cohort, CohortRun
 from tkamb.studies.cohort.statistics import Group
-from tkamb.studies.verdict import KINDS, VERDICT, Verdict
+from tkamb.studies.verdict import KINDS, MAX_ERROR, Verdict
 
 WEAR = "volume_mm3_per_Mc"
 """Key of the worn volume in `Group.wear`. With _low or _high: an end of the wear factor's range."""
@@ -34,16 +34,9 @@ BANDS = (
 )
 
 
-@dataclass(frozen=True)
-class DesignFigureSettings:
-    """Style of the figure of designs."""
-
-    spread: float = 0.5
-    """1: width of the dots of one tick on the horizontal axis, as a share of the distance between
-    ticks. Chosen by eye."""
-
-
-DESIGN_FIGURE = DesignFigureSettings()
+# 1: width of the dots of one tick on the horizontal axis, as a share of the distance between
+# ticks. Chosen by eye.
+SPREAD = 0.5
 
 
 @dataclass(frozen=True)
@@ -154,7 +147,7 @@ def draw_designs(bars: Mapping[str, Sequence[Bar]]) -> Figure:
 def _draw_bars(axes: Axes, bars: Sequence[Bar]) -> None:
     places = list(dict.fromkeys(bar.place for bar in bars))
     series = list(dict.fromkeys(bar.series for bar in bars))
-    step = DESIGN_FIGURE.spread / max(len(series), 1)
+    step = SPREAD / max(len(series), 1)
     for k, name in enumerate(series):
         some = [bar for bar in bars if bar.series == name]
         shift = (k - 0.5 * (len(series) - 1)) * step
@@ -195,10 +188,10 @@ def picture(verdicts: Sequence[Verdict]) -> Figure:
                 alpha=0.75,
                 label=f"{kind.replace('_', ' ')} ({len(some)})",
             )
-        axis.axvline(VERDICT.max_error, color=GREY, lw=1, ls="--")
+        axis.axvline(MAX_ERROR, color=GREY, lw=1, ls="--")
         top = len(groups) - 0.3
         words = "wrong beyond 2 %; closed forms beyond their own bound "
-        axis.text(VERDICT.max_error, top, words, color=GREY, fontsize=7.5, ha="right")
+        axis.text(MAX_ERROR, top, words, color=GREY, fontsize=7.5, ha="right")
         axis.text(1.0, top, "no answer", color=GREY, fontsize=7.5, ha="center")
         axis.set(xscale="log", xlim=(1e-9, 3.0), xlabel="largest distance from the reference")
         axis.set_yticks(range(len(groups)), groups, fontsize=7.5)

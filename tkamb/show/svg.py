@@ -5,7 +5,6 @@ The size of each text is computed once for all figures.
 
 import base64
 import io
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -22,20 +21,12 @@ from matplotlib.transforms import Affine2DBase
 from numpy.typing import NDArray
 from PIL import Image
 
-
-@dataclass(frozen=True)
-class LabelPlaceSettings:
-    """Room around the labels of a figure."""
-
-    edge_points: float = 3.0
-    """Points: margin around all labels of a figure. Chosen by eye."""
-    tick_points: float = 6.5
-    """Points: length of a tick and the gap to its label. Chosen by eye."""
-    tick_label_points: float = 9.0
-    """Points: size of letters at ticks. Chosen by eye."""
-
-
-LABEL_PLACE = LabelPlaceSettings()
+# Points: margin around all labels of a figure. Chosen by eye.
+EDGE_POINTS = 3.0
+# Points: length of a tick and the gap to its label. Chosen by eye.
+TICK_POINTS = 6.5
+# Points: size of letters at ticks. Chosen by eye.
+TICK_LABEL_POINTS = 9.0
 
 
 def set_place(axes: Axes, x: float, bottom: float, wide: float, tall: float) -> None:
@@ -61,7 +52,7 @@ def shown_labels(axis: Axis) -> list[tuple[float, float]]:
     labels = axis.get_major_formatter().format_ticks(list(ticks))
     places = [(tick - low) / (high - low) for tick in ticks]
     return [
-        (place, text_width(label, LABEL_PLACE.tick_label_points))
+        (place, text_width(label, TICK_LABEL_POINTS))
         for place, label in zip(places, labels, strict=True)
         if 0.0 <= place <= 1.0
     ]

@@ -1,7 +1,6 @@
 """Report of the trade-off study: table, picture, fastest model for an error, comparisons."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from statistics import median
 
 from matplotlib.artist import Artist
@@ -12,26 +11,20 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from tkamb.geometry.frames import SIDES
 from tkamb.show.style import CYCLE, GREY, new_figure, settings
 from tkamb.studies.references import Reference
-from tkamb.studies.tradeoff import FRONT_ERRORS, KEYS, TIMING, Row
+from tkamb.studies.tradeoff import EQUAL_RATIO, FRONT_ERRORS, KEYS, Row
 
 MARKERS = "osD^vPX*<>"
 
 
-@dataclass(frozen=True)
-class TradeoffPictureSettings:
-    """Report of the trade-off study."""
+# mm: cell size that is not written beside its point. Chosen because most points have it.
+UNLABELLED_MM = 2.0
+# 1: a logarithmic axis also has labels within its decades if the ratio of its two ends is smaller
+# than this. Chosen because on longer axes the labels of the decades are enough.
+SHORT_AXIS_RATIO = 30.0
+# Smallest number of different pairs of bodies that gives a recommendation. Chosen because the two
+# pairs of the quick study suit `hertz`, whose errors on a knee are larger.
+MIN_BODIES = 3
 
-    unlabelled_mm: float = 2.0
-    """mm: cell size that is not written beside its point. Chosen because most points have it."""
-    short_axis_ratio: float = 30.0
-    """1: a logarithmic axis also has labels within its decades if the ratio of its two ends is
-    smaller than this. Chosen because on longer axes the labels of the decades are enough."""
-    min_bodies: int = 3
-    """Smallest number of different pairs of bodies that gives a recommendation. Chosen because
-    the two pairs of the quick study suit `hertz`, whose errors on a knee are larger."""
-
-
-TRADEOFF_PICTURE = TradeoffPictureSettings()
 
 LIMITS = {
     "approach": (0.05,),
@@ -68,7 +61,7 @@ def table(rows: Sequence[Row], references: dict[str, Reference]) -> list[str]:
         lines.append("")
     names = ", ".join(name.replace("_", " ") for name in FRONT_ERRORS)
     lines.append("* on the Pareto front of warm time against the largest of the errors in")
-    tie = f"medians of time within {100 * (TIMING.equal_ratio - 1):.0f} % count as equal"
+    tie = f"medians of time within {100 * (EQUAL_RATIO - 1):.0f} % count as equal"
     return [*lines, f"  {names}; {tie}. One thread."]
 
 
@@ -122,8 +115,7 @@ def picture(rows: Sequence[Row]) -> Figure:
             list(result),
             loc="outside upper left",
             ncols=2 * columns,
-            title="numbers at the points: cell size, mm; "
-            f"{TRADEOFF_PICTURE.unlabelled_mm:g} mm where there is none",
+            title=f"numbers at the points: cell size, mm; {UNLABELLED_MM:g} mm where there is none",
             alignment="left",
         )
     return figure
@@ -146,7 +138,7 @@ def _panel(axis: Axes, rows: Sequence[Row], labels: Sequence[str]) -> None:
             label=label,
         )
         for row in some:
-            if row.job.resolution_mm == TRADEOFF_PICTURE.unlabelled_mm:
+            if row.job.resolution_mm == UNLABELLED_MM:
                 continue
             axis.annotate(
                 f"{row.job.resolution_mm:g}",
@@ -164,7 +156,7 @@ def _panel(axis: Axes, rows: Sequence[Row], labels: Sequence[str]) -> None:
 def _plain_ticks(axis: Axes) -> None:
     """Label short logarithmic axes at 1, 2, 5, 10 and so on, also in panels that share them."""
     for side, (low, high) in ((axis.xaxis, axis.get_xlim()), (axis.yaxis, axis.get_ylim())):
-        if high < TRADEOFF_PICTURE.short_axis_ratio * low:
+        if high < SHORT_AXIS_RATIO * low:
             side.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
             side.set_major_formatter("{x:g}")
             side.set_minor_formatter(NullFormatter())
@@ -192,7 +184,7 @@ def recommendations(rows: Sequence[Row]) -> list[str]:
     Only settings with results on all pairs of bodies are compared. Their time is the median over
     the pairs of the time of a warm press.
     """
-    if len({bodies_of(row.job.case) for row in rows}) < TRADEOFF_PICTURE.min_bodies:
+    if len({bodies_of(row.job.case) for row in rows}) < MIN_BODIES:
         return ["no recommendation from so few cases: run the whole study, without --quick"]
     settings = _settings_on_all_bodies(rows)
     return [

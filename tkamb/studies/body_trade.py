@@ -27,16 +27,9 @@ if TYPE_CHECKING:
     from tkamb.run.results import Results
 
 
-@dataclass(frozen=True)
-class BodyTradeSettings:
-    """Frames that the study compares."""
-
-    stride: int = 10
-    """Recorded frames from one compared frame to the next. Chosen because every frame rate of the
-    study contains these frames."""
-
-
-BODY_TRADE = BodyTradeSettings()
+# Recorded frames from one compared frame to the next. Chosen because every frame rate of the study
+# contains these frames.
+STRIDE = 10
 
 
 @dataclass(frozen=True)
@@ -131,7 +124,7 @@ def _run(change: Change) -> _Run:
         path = copied_scene(Path(folder))
         if change.every > 1:
             thin_out(Path(folder), change.every)
-        frames = slice(0, None, BODY_TRADE.stride // change.every)
+        frames = slice(0, None, STRIDE // change.every)
         start = clock.perf_counter()
         scene = load_scene(path, change.keys)
         results = simulate(scene, frames=frames)

@@ -41,19 +41,13 @@ from tkamb.units import MEGAPASCAL, MILLIMETRE
 PROGRAM = "ccx"
 
 
-@dataclass(frozen=True)
-class CalculixSettings:
-    """Time limit of CalculiX, and the interval of its memory readings."""
+# s: time limit of a run. A longer run is stopped and has no result. Chosen because most runs take
+# less than a minute.
+LONGEST_SECONDS = 600.0
+# s: interval between two readings of the memory of the process. Chosen because it is short
+# compared with a run and costs little.
+POLL_SECONDS = 0.05
 
-    longest_seconds: float = 600.0
-    """s: time limit of a run. A longer run is stopped and has no result. Chosen because most runs
-    take less than a minute."""
-    poll_seconds: float = 0.05
-    """s: interval between two readings of the memory of the process. Chosen because it is short
-    compared with a run and costs little."""
-
-
-CALCULIX = CalculixSettings()
 
 OUTPUT_FILE = "output"
 
@@ -87,7 +81,7 @@ def find_program() -> str:
     return result
 
 
-def run_calculix(text: str, longest: float = CALCULIX.longest_seconds) -> PeerRun:
+def run_calculix(text: str, longest: float = LONGEST_SECONDS) -> PeerRun:
     """Run CalculiX on an input deck.
 
     Args:
@@ -130,7 +124,7 @@ def _wait(command: list[str], place: Path, longest: float) -> float:
                 if clock.perf_counter() - start > longest:
                     raise ComputationError(f"stopped after {longest:g} s", "CalculiX")
                 with suppress(subprocess.TimeoutExpired):
-                    process.wait(CALCULIX.poll_seconds)
+                    process.wait(POLL_SECONDS)
         finally:
             process.kill()
     if process.returncode:
@@ -167,16 +161,9 @@ def _blocks(lines: Iterable[str]) -> dict[str, Array]:
     return {name: np.array(rows) for name, rows in blocks.items() if rows}
 
 
-@dataclass(frozen=True)
-class PeerSettings:
-    """Condition on which a result of CalculiX is accepted."""
-
-    max_residual: float = 0.01
-    """Largest difference between the summed contact forces and the load, relative to the load.
-    Chosen because converged solutions differ by less."""
-
-
-PEER = PeerSettings()
+# Largest difference between the summed contact forces and the load, relative to the load. Chosen
+# because converged solutions differ by less.
+MAX_RESIDUAL = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,7 +186,7 @@ class PeerAnswer:
 
 
 def measure_by_calculix(
-    case: StudyCase, grid_mm: float, longest: float = CALCULIX.longest_seconds
+    case: StudyCase, grid_mm: float, longest: float = LONGEST_SECONDS
 ) -> Measure:
     """Return cost and results of CalculiX on a case; after an error only the status.
 
@@ -232,7 +219,7 @@ def press_by_calculix(
     pose: Array,
     grid_mm: float,
     element: str = ELEMENT,
-    longest: float = CALCULIX.longest_seconds,
+    longest: float = LONGEST_SECONDS,
 ) -> PeerAnswer:
     """Press a femoral component on an insert with CalculiX.
 
@@ -272,7 +259,7 @@ def peer_result(problem: PressProblem, run: PeerRun) -> tuple[ContactResult, flo
     deformed = _deformed_map(problem, run)
     force = _nodal_forces(problem, pose, run, deformed)
     balance = -float(force[:, 1].sum()) / problem.load
-    if not abs(balance - 1) <= PEER.max_residual:
+    if not abs(balance - 1) <= MAX_RESIDUAL:
         raise ComputationError(
             f"gave contact forces that sum to {balance:.4f} of the load", "CalculiX"
         )

@@ -46,21 +46,15 @@ CURVE = {"alpha": 0.0389, "reference_stress": 8.4194 * MEGAPASCAL, "exponent": 4
 """Published Ramberg-Osgood parameters of the polyethylene of these cases (`docs/contact.md`)."""
 
 
-@dataclass(frozen=True)
-class ClosedFormSettings:
-    """Bodies with an analytic solution."""
+# mm: side of the block under the plate. Chosen because cells of 2 and 3 mm divide it.
+BLOCK_SIDE_MM = 24.0
+# mm: cell size of the "kept" cases. Chosen because the cache does not store the smaller operators
+# of larger cells.
+KEPT_GRID_MM = 0.9
+# Approach of the plate on Sharma's springs over its approach on the elastic solid. The springs
+# have nu = 0.35 for every material and are too stiff at free sides. Measured.
+SHARMA_APPROACH_RATIO = 0.6808
 
-    block_side_mm: float = 24.0
-    """mm: side of the block under the plate. Chosen because cells of 2 and 3 mm divide it."""
-    kept_grid_mm: float = 0.9
-    """mm: cell size of the "kept" cases. Chosen because the cache does not store the smaller
-    operators of larger cells."""
-    sharma_approach_ratio: float = 0.6808
-    """Approach of the plate on Sharma's springs over its approach on the elastic solid. The springs
-    have nu = 0.35 for every material and are too stiff at free sides. Measured."""
-
-
-CLOSED_FORM = ClosedFormSettings()
 
 TOLERANCES: dict[str, tuple[float, float]] = {
     "plate": (5e-3, 0.01),
@@ -120,9 +114,7 @@ class ClosedForm:
         """The two bodies."""
         thick = self.thickness_mm * MILLIMETRE
         side = (
-            CLOSED_FORM.block_side_mm * MILLIMETRE
-            if self.plate
-            else 2.5 * self.radius_mm**0.5 * 1.6e-3 + 6e-3
+            BLOCK_SIDE_MM * MILLIMETRE if self.plate else 2.5 * self.radius_mm**0.5 * 1.6e-3 + 6e-3
         )
         side = 6e-3 * round(side / 6e-3)
         insert = block(flat(thick), (side, side), 3e-3)
@@ -184,12 +176,12 @@ def solution(case: ClosedForm) -> tuple[float, float]:
     load, thick = case.load_N, case.thickness_mm * MILLIMETRE
     young, radius = case.modulus_MPa * MEGAPASCAL, case.radius_mm * MILLIMETRE
     if case.plate:
-        stress = load / (CLOSED_FORM.block_side_mm * MILLIMETRE) ** 2
+        stress = load / (BLOCK_SIDE_MM * MILLIMETRE) ** 2
         strain = _strain(case, stress)
         if case.model == "foundation":
             strain = 1.0 - np.exp(-strain)
         if case.model == "lattice-source":
-            strain *= CLOSED_FORM.sharma_approach_ratio
+            strain *= SHARMA_APPROACH_RATIO
         return thick * strain, stress
     if case.kind == "layer":
         layer = sphere_on_layer(radius, thick, load, young, case.nu)
@@ -212,7 +204,7 @@ def closed_forms(quick: bool) -> Iterator[ClosedForm]:
     for model in (*solids, "lattice-source", "foundation", "foundation-linear"):
         yield ClosedForm("plate", model)
     yield ClosedForm("slide", "lattice", 10000.0, nu=0.45)
-    yield ClosedForm("kept", "lattice-linear", resolution_mm=CLOSED_FORM.kept_grid_mm)
+    yield ClosedForm("kept", "lattice-linear", resolution_mm=KEPT_GRID_MM)
     yield ClosedForm("hertz", "hertz", 100.0, 10.0, nu=0.45, radius_mm=22.0, resolution_mm=1.0)
     yield _wide("layer", "lattice-linear", linear=True)
     for model in ("foundation", "foundation-linear"):
@@ -244,7 +236,7 @@ def _more_closed_forms(solids: tuple[str, ...]) -> Iterator[ClosedForm]:
         yield _wide("bed", model, load)
     for load, nu in product((100.0, 1000.0), (0.0, 0.4999)):
         yield ClosedForm("hertz", "hertz", load, 30.0, nu=nu, radius_mm=22.0, resolution_mm=1.0)
-    yield ClosedForm("kept", "fe", resolution_mm=CLOSED_FORM.kept_grid_mm)
+    yield ClosedForm("kept", "fe", resolution_mm=KEPT_GRID_MM)
 
 
 def _strain(case: ClosedForm, stress: float) -> float:
@@ -279,7 +271,7 @@ def _column(case: ClosedForm) -> Callable[[float], float]:
 def _inner(result: ContactResult) -> Mask:
     """Return which map points lie at least a fifth of the block's side from its edges."""
     across = np.abs(result.points[:, [0, 2]]).max(axis=1)
-    inner: Mask = across < 0.3 * CLOSED_FORM.block_side_mm * MILLIMETRE
+    inner: Mask = across < 0.3 * BLOCK_SIDE_MM * MILLIMETRE
     return inner
 
 

@@ -16,17 +16,8 @@ from tkamb.geometry.surface import Surface
 from tkamb.studies.cases import Height, balls, block, dishes, flat
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
-
-@dataclass(frozen=True)
-class ExtremeMeshSettings:
-    """Meshes of the study of extreme cases."""
-
-    sectors: int = 48
-    """Vertices of a ring of the condyles. A coarse mesh suffices, because all compared models use
-    it."""
-
-
-EXTREME_MESH = ExtremeMeshSettings()
+# Vertices of a ring of the condyles. A coarse mesh suffices, because all compared models use it.
+SECTORS = 48
 
 
 Shape = Literal["usual", "swapped", "lip", "spike", "subdivided", "slivers"]
@@ -98,7 +89,7 @@ class Extreme:
         size = (26e-3 * self.aspect, 46e-3 if apart else 26e-3)
         insert = block(height, size, 1e-3)
         femoral = _roughened(
-            balls(radius, apart, self.waist, self.facet_deg, EXTREME_MESH.sectors), self.rough_mm
+            balls(radius, apart, self.waist, self.facet_deg, SECTORS), self.rough_mm
         )
         femoral = _shaped(femoral, self.shape)
         if self.shape == "swapped":
@@ -131,7 +122,7 @@ def _shaped(surface: Surface, shape: Shape) -> Surface:
     if shape == "spike":
         vertices[np.argmin(vertices[:, 1])] -= [0.0, 3 * MILLIMETRE, 0.0]
     elif shape == "slivers":
-        first = np.arange(1, len(vertices) - EXTREME_MESH.sectors - 1, EXTREME_MESH.sectors)
+        first = np.arange(1, len(vertices) - SECTORS - 1, SECTORS)
         vertices[first] += 0.98 * (vertices[first + 1] - vertices[first])
     elif shape == "subdivided":
         vertices, faces = trimesh.remesh.subdivide(vertices, faces)

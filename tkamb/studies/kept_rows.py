@@ -15,7 +15,7 @@ from pydantic import TypeAdapter
 
 from tkamb import code_identity
 from tkamb.errors import InputError
-from tkamb.files import FILE_LIMITS, read_bytes, undamaged, write_text
+from tkamb.files import TABLE_BYTES, read_bytes, undamaged, write_text
 
 FILE_NAME = "rows.jsonl"
 
@@ -80,7 +80,7 @@ def _row_hash(key: str, row: Row) -> str:
 
 def _whole_rows(path: Path) -> dict[str, Row]:
     result: dict[str, Row] = {}
-    content = read_bytes(path, FILE_LIMITS.table_bytes) if path.exists() else b""
+    content = read_bytes(path, TABLE_BYTES) if path.exists() else b""
     for line in content.decode(errors="replace").splitlines():
         try:
             one = json.loads(line)

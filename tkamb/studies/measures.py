@@ -114,24 +114,18 @@ def map_error(raster: Raster, reference: Raster) -> float:
     return float(np.linalg.norm(computed - true) / np.linalg.norm(true))
 
 
-@dataclass(frozen=True)
-class MeasureSettings:
-    """Time measurements of the trade-off study."""
+# s: time limit of a job. A longer job is stopped and has no result. Chosen because the study
+# should take minutes.
+LONGEST_SECONDS = 300.0
+# Largest number of timed preparations and first presses, and smallest number of timed warm
+# presses. Chosen because the median of three ignores one slow press.
+REPEATS = 3
+# Largest number of timed warm presses. Chosen because their median ignores slow ones.
+WARM_PRESSES = 7
+# s: measured time after which only warm presses are repeated, up to `REPEATS`. Chosen because the
+# study should take minutes.
+ENOUGH_SECONDS = 3.0
 
-    longest_seconds: float = 300.0
-    """s: time limit of a job. A longer job is stopped and has no result. Chosen because the study
-    should take minutes."""
-    repeats: int = 3
-    """Largest number of timed preparations and first presses, and smallest number of timed warm
-    presses. Chosen because the median of three ignores one slow press."""
-    warm_presses: int = 7
-    """Largest number of timed warm presses. Chosen because their median ignores slow ones."""
-    enough_seconds: float = 3.0
-    """s: measured time after which only warm presses are repeated, up to `repeats`. Chosen because
-    the study should take minutes."""
-
-
-MEASURE = MeasureSettings()
 
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", threads.VARIABLE), "1"
@@ -201,7 +195,7 @@ class Measure:
     map: dict[str, float] = field(default_factory=dict)
 
 
-def measure_apart(job: Job, longest: float = MEASURE.longest_seconds) -> Measure:
+def measure_apart(job: Job, longest: float = LONGEST_SECONDS) -> Measure:
     """Measure a job in a new process with a time limit, s."""
     command = [sys.executable, "-m", "tkamb.studies.measures"]
     try:
@@ -265,15 +259,13 @@ def _first(
         cold, (result, warm_start) = _timed(model.press_from, state, case.load, case.pose)
         prepares.append(prepare)
         colds.append(cold)
-        if len(colds) == MEASURE.repeats or sum(prepares) + sum(colds) > MEASURE.enough_seconds:
+        if len(colds) == REPEATS or sum(prepares) + sum(colds) > ENOUGH_SECONDS:
             return (median(prepares), median(colds)), (case, state, result, warm_start)
 
 
 def _warm(model: ContactModel, state: Any, case: StudyCase, warm_start: WarmStart) -> float:
     seconds: list[float] = []
-    while len(seconds) < MEASURE.repeats or (
-        len(seconds) < MEASURE.warm_presses and sum(seconds) < MEASURE.enough_seconds
-    ):
+    while len(seconds) < REPEATS or (len(seconds) < WARM_PRESSES and sum(seconds) < ENOUGH_SECONDS):
         pose = case.nearby(len(seconds) + 1)
         duration, (_, warm_start) = _timed(model.press_from, state, case.load, pose, warm_start)
         seconds.append(duration)

@@ -44,20 +44,12 @@ from tkamb.studies.measures import (
 )
 from tkamb.units import MILLIMETRE
 
-
-@dataclass(frozen=True)
-class ElasticLayerSettings:
-    """Numerical solution of a layer under a sphere."""
-
-    rings: int = 160
-    """Rings of constant pressure under the sphere. Chosen because twice as many have no effect on
-    the comparisons."""
-    half_space_wave_number: float = 60.0
-    """Wave number times thickness above which the layer is treated as a half-space. Chosen because
-    the difference is below round-off."""
-
-
-ELASTIC_LAYER = ElasticLayerSettings()
+# Rings of constant pressure under the sphere. Chosen because twice as many have no effect on the
+# comparisons.
+RINGS = 160
+# Wave number times thickness above which the layer is treated as a half-space. Chosen because the
+# difference is below round-off.
+HALF_SPACE_WAVE_NUMBER = 60.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,22 +93,20 @@ def _indented(
     radius: float, thickness: float, contact: float, young: float, nu: float
 ) -> tuple[LayerContact, float]:
     """Return the contact with a given contact radius, m, and its load, N."""
-    angle = np.linspace(0.0, np.pi / 2, ELASTIC_LAYER.rings + 1)
+    angle = np.linspace(0.0, np.pi / 2, RINGS + 1)
     edges, middles = contact * np.sin(angle), contact * np.sin((angle[1:] + angle[:-1]) / 2)
     disk = _disks(middles, edges[1:], thickness, young, nu)
-    matrix = np.zeros((ELASTIC_LAYER.rings + 1, ELASTIC_LAYER.rings + 1))
+    matrix = np.zeros((RINGS + 1, RINGS + 1))
     # a ring is the difference of two disks
-    matrix[: ELASTIC_LAYER.rings, : ELASTIC_LAYER.rings] = disk - np.column_stack(
-        [np.zeros(ELASTIC_LAYER.rings), disk[:, :-1]]
-    )
-    matrix[: ELASTIC_LAYER.rings, ELASTIC_LAYER.rings] = -1.0
+    matrix[:RINGS, :RINGS] = disk - np.column_stack([np.zeros(RINGS), disk[:, :-1]])
+    matrix[:RINGS, RINGS] = -1.0
     # at the edge of the contact the pressure falls as the square root of the distance
     root = np.sqrt(1 - (middles[-2:] / contact) ** 2)
-    matrix[ELASTIC_LAYER.rings, ELASTIC_LAYER.rings - 2 : ELASTIC_LAYER.rings] = [root[1], -root[0]]
+    matrix[RINGS, RINGS - 2 : RINGS] = [root[1], -root[0]]
     solution = np.linalg.solve(matrix, np.append(-(middles**2) / (2 * radius), 0.0))
-    pressure = solution[: ELASTIC_LAYER.rings]
+    pressure = solution[:RINGS]
     force = float(pressure @ (np.pi * np.diff(edges**2)))
-    return LayerContact(contact, float(solution[ELASTIC_LAYER.rings]), middles, pressure), force
+    return LayerContact(contact, float(solution[RINGS]), middles, pressure), force
 
 
 def _disks(at: Array, radii: Array, thickness: float, young: float, nu: float) -> Array:
@@ -127,13 +117,13 @@ def _disks(at: Array, radii: Array, thickness: float, young: float, nu: float) -
     outside = 4 * r / np.pi * (ellipe(share) - (1 - share) * ellipk(share))
     half_space = np.where(r < b, inside, outside) / 2
     nodes, weights = np.polynomial.legendre.leggauss(400)
-    w = (nodes + 1) * ELASTIC_LAYER.half_space_wave_number / 2
+    w = (nodes + 1) * HALF_SPACE_WAVE_NUMBER / 2
     k, kappa = w / thickness, 3 - 4 * nu
     layer = (2 * kappa * np.sinh(2 * w) - 4 * w) / (
         2 * kappa * np.cosh(2 * w) + 1 + kappa**2 + 4 * w**2
     ) - 1
     transform = radii[:, None] * j1(k[None] * radii[:, None]) / k
-    step = layer * weights * ELASTIC_LAYER.half_space_wave_number / 2 / thickness
+    step = layer * weights * HALF_SPACE_WAVE_NUMBER / 2 / thickness
     difference = j0(k[None] * at[:, None]) @ (step * transform).T
     return 2 * (1 - nu**2) / young * (half_space + difference)
 
@@ -144,21 +134,13 @@ GRIDS_MM = (1.5, 1.25, 1.0, 0.8)
 LARGE_GRIDS_MM = (2.0, 1.5, 1.25, 1.0)
 
 
-@dataclass(frozen=True)
-class ReferenceSettings:
-    """Computation of the reference solutions."""
-
-    large_volume: float = 2e-5
-    """m³: volume of the insert's bounding box above which coarser grids are used. Chosen because
-    the finest grid of such an insert does not fit into memory."""
-    tolerance: float = 1e-6
-    """Relative tolerance of the reference solutions. Chosen far below the compared errors."""
-    width_effect: float = 0.005
-    """Relative difference between a block 3.4 times as wide as high and an infinite layer.
-    Computed."""
-
-
-REFERENCE = ReferenceSettings()
+# m³: volume of the insert's bounding box above which coarser grids are used. Chosen because the
+# finest grid of such an insert does not fit into memory.
+LARGE_VOLUME = 2e-5
+# Relative tolerance of the reference solutions. Chosen far below the compared errors.
+TOLERANCE = 1e-6
+# Relative difference between a block 3.4 times as wide as high and an infinite layer. Computed.
+WIDTH_EFFECT = 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,14 +176,14 @@ def compute_reference(case: StudyCase, grids_mm: tuple[float, ...] | None = None
         ComputationError: a grid did not converge.
     """
     if grids_mm is None:
-        large = float(np.prod(np.ptp(case.pair.insert.vertices, axis=0))) > REFERENCE.large_volume
+        large = float(np.prod(np.ptp(case.pair.insert.vertices, axis=0))) > LARGE_VOLUME
         grids_mm = LARGE_GRIDS_MM if large else GRIDS_MM
     solved: dict[str, Quantities] = {}
     finest: dict[str, float] = {}
     for family in FAMILIES:
         for grid in grids_mm:
             model = contact_model(
-                family, resolution=grid * MILLIMETRE, tolerance=REFERENCE.tolerance, cache=False
+                family, resolution=grid * MILLIMETRE, tolerance=TOLERANCE, cache=False
             )
             result = model.press(model.prepare(case.pair), case.load, case.pose)
             if result.status is not ContactStatus.OK:
@@ -275,7 +257,7 @@ def _by_layer(case: StudyCase, sphere: Sphere) -> tuple[Quantities, Quantities]:
         "medial_area": area,
     }
     values |= {name.replace("medial", "lateral"): 0.0 for name in list(values) if "medial" in name}
-    return values, {name: REFERENCE.width_effect * value for name, value in values.items()}
+    return values, {name: WIDTH_EFFECT * value for name, value in values.items()}
 
 
 def read_references(path: Path = STORED) -> dict[str, Reference]:

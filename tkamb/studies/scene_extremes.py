@@ -24,7 +24,7 @@ from tkamb.errors import TkambError
 from tkamb.geometry.frames import Array
 from tkamb.run.status import FAILED
 from tkamb.studies.cases import SHIPPED_SCENE, change_recording, copied_scene, stretch_time
-from tkamb.studies.verdict import VERDICT, Verdict
+from tkamb.studies.verdict import MAX_ERROR, Verdict
 
 if TYPE_CHECKING:
     from tkamb.run.results import Results
@@ -34,16 +34,10 @@ FRAMES = slice(20, 101, 40)
 TIME_SCALES = (1e-3, 1e-2, 0.1, 0.3, 3.0, 20.0, 1e4)
 
 
-@dataclass(frozen=True)
-class InertiaStudySettings:
-    """Measurement of the effect of inertia: the recorded motion against a slow one."""
+# Duration of the slow motion over that of the recorded motion. Chosen because the inertia forces
+# are then 1 % of those of the recorded motion.
+SLOW_FACTOR = 10.0
 
-    slow_factor: float = 10.0
-    """Duration of the slow motion over that of the recorded motion. Chosen because the inertia
-    forces are then 1 % of those of the recorded motion."""
-
-
-INERTIA_STUDY = InertiaStudySettings()
 
 NOISES = (1e-3, 1e-2, 0.1, 1.0)
 FRICTIONS = (0.0, 0.2, 0.6, 1.0)
@@ -101,7 +95,7 @@ def judge_scene(extreme: SceneExtreme) -> Verdict:
     flags = "; ".join(sorted({status for status in results.status if status != "ok"}))
     if any(status.startswith(FAILED) for status in results.status):
         return Verdict(extreme.label, "run", "flagged", flags, seconds=seconds)
-    correct = math.isfinite(error) and error <= VERDICT.max_error
+    correct = math.isfinite(error) and error <= MAX_ERROR
     kind = "converged" if correct else "flagged" if flags else "unflagged_wrong"
     reason = flags if correct or flags else f"{100 * error:.3g} % from the expected result"
     finite_error = error if math.isfinite(error) else None
@@ -140,9 +134,9 @@ def _relative_error(extreme: SceneExtreme, results: "Results", folder: Path) -> 
     error = float(np.max(np.abs(force - required) / np.abs(required)))
     if extreme.kind == "time":
         recorded = _run(SHIPPED_SCENE, {})["force_si_N"]
-        stretch_time(folder, INERTIA_STUDY.slow_factor / extreme.value)
+        stretch_time(folder, SLOW_FACTOR / extreme.value)
         slow = _run(folder / "scene.toml", {})["force_si_N"]
-        inertia = (recorded - slow) / (1.0 - 1.0 / INERTIA_STUDY.slow_factor**2)
+        inertia = (recorded - slow) / (1.0 - 1.0 / SLOW_FACTOR**2)
         expected = recorded - inertia + inertia / extreme.value**2
         return max(error, float(np.max(np.abs(required - expected) / np.abs(expected))))
     if extreme.kind in ("femoral", "insert"):

@@ -45,16 +45,9 @@ KEYS = ("approach", "force", "mean_pressure", "peak_pressure", "area", "map")
 TIMES = ("prepare_seconds", "cold_seconds", "warm_seconds", "peak_rss_MB")
 
 
-@dataclass(frozen=True)
-class TimingSettings:
-    """Comparison of times."""
-
-    equal_ratio: float = 1.2
-    """Ratio of two median times below which they count as equal. Chosen because repeated
-    measurements vary by this factor."""
-
-
-TIMING = TimingSettings()
+# Ratio of two median times below which they count as equal. Chosen because repeated measurements
+# vary by this factor.
+EQUAL_RATIO = 1.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,10 +146,10 @@ def beats(first: tuple[float, float], second: tuple[float, float]) -> bool:
     """Return whether the first point (seconds, error) beats the second.
 
     It is faster and at least as accurate, or more accurate and not slower. Times within
-    `TIMING.equal_ratio` count as equal.
+    `EQUAL_RATIO` count as equal.
     """
-    faster = first[0] * TIMING.equal_ratio < second[0]
-    not_slower = first[0] <= second[0] * TIMING.equal_ratio
+    faster = first[0] * EQUAL_RATIO < second[0]
+    not_slower = first[0] <= second[0] * EQUAL_RATIO
     return (first[1] <= second[1] and faster) or (first[1] < second[1] and not_slower)
 
 

@@ -49,20 +49,13 @@ from tkamb.studies.extremes import Extreme
 from tkamb.studies.measures import Quantities, errors, quantities
 from tkamb.units import MILLIMETRE
 
+# Largest relative difference of forces and pressures from the load. Chosen as a few times the
+# solver's tolerance.
+FORCE_TOLERANCE = 0.005
+# Largest penetration of a node into the femoral component over the approach. Chosen as a few times
+# the solver's tolerance.
+PENETRATION_TOLERANCE = 5e-3
 
-@dataclass(frozen=True)
-class AuditSettings:
-    """Tolerances of the checks that need no reference."""
-
-    force_tolerance: float = 0.005
-    """Largest relative difference of forces and pressures from the load. Chosen as a few times the
-    solver's tolerance."""
-    penetration_tolerance: float = 5e-3
-    """Largest penetration of a node into the femoral component over the approach. Chosen as a few
-    times the solver's tolerance."""
-
-
-AUDIT = AuditSettings()
 
 PEER_ANSWERS = Path(__file__).with_name("peer_answers.json")
 PEER_BOUNDS = {"approach": 0.035, "force": 0.01, "mean_pressure": 0.09, "peak_pressure": 0.09}
@@ -98,21 +91,18 @@ def complaints(result: ContactResult, load: float, solved: bool, source_rule: bo
     ]
     if result.pressure.min() < 0:
         problems.append("a pressure is negative")
-    if (
-        by_sides < (1 - AUDIT.force_tolerance) * load
-        or by_sides > (1 + AUDIT.force_tolerance) * force.sum()
-    ):
+    if by_sides < (1 - FORCE_TOLERANCE) * load or by_sides > (1 + FORCE_TOLERANCE) * force.sum():
         problems.append(f"the condyles carry {by_sides:.4g} N of {load:.4g} N")
-    if solved and abs(peak - highest) > AUDIT.force_tolerance * highest:
+    if solved and abs(peak - highest) > FORCE_TOLERANCE * highest:
         problems.append(f"the condyles' peak is {peak / highest:.4g} of the map's peak")
     deepest = -float(np.nanmin(result.gap))
-    if solved and deepest > AUDIT.penetration_tolerance * result.approach:
+    if solved and deepest > PENETRATION_TOLERANCE * result.approach:
         problems.append(f"a node is {1e6 * deepest:.3g} µm inside the femoral component")
     return [words for words in problems if words]
 
 
 def _off(what: str, value: float, expected: float) -> str:
-    if math.isclose(value, expected, rel_tol=AUDIT.force_tolerance):
+    if math.isclose(value, expected, rel_tol=FORCE_TOLERANCE):
         return ""
     return f"{what} {value / expected:.4f} of the expected value"
 
@@ -149,16 +139,10 @@ def peer_distances(extreme: Extreme, result: ContactResult) -> dict[str, float]:
     return {name: differences[name] for name in PEER_BOUNDS}
 
 
-@dataclass(frozen=True)
-class VerdictSettings:
-    """Accuracy that the stability study requires."""
+# Relative difference from the reference above which a result is wrong. Chosen below the published
+# differences between models and experiments.
+MAX_ERROR = 0.02
 
-    max_error: float = 0.02
-    """Relative difference from the reference above which a result is wrong. Chosen below the
-    published differences between models and experiments."""
-
-
-VERDICT = VerdictSettings()
 
 JUDGED = ("approach", "force", "peak_pressure")
 NEWTON_TOLERANCES = (1e-6, 1e-4, 1e-3)
@@ -291,7 +275,7 @@ def compared(
     """Return the verdict on a result with status ok, compared with its reference."""
     differences = errors(quantities(result), quantities(reference))
     distance = max(differences[key] for key in JUDGED)
-    correct = math.isfinite(distance) and distance <= VERDICT.max_error
+    correct = math.isfinite(distance) and distance <= MAX_ERROR
     flags = "; ".join(result.flags)
     kind = "converged" if correct else "flagged" if flags else "unflagged_wrong"
     reason = flags if correct or flags else f"{100 * distance:.3g} % from the reference"

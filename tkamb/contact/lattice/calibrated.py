@@ -25,7 +25,7 @@ import numpy as np
 import scipy.sparse as sparse
 
 from tkamb.contact.lattice.meshing.cells import CORNERS, PAIR_AXES, PAIRS
-from tkamb.contact.lattice.solid import STRESS_CURVE, ShearCurve, Solid, chunks
+from tkamb.contact.lattice.solid import LEAST_STRAIN, ShearCurve, Solid, chunks
 from tkamb.contact.materials import Material
 from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array, Index
@@ -408,7 +408,7 @@ class CalibratedNetwork(Solid):
             self.curve.shear_modulus,
             self.curve.spline.x,
             self.curve.spline.c,
-            STRESS_CURVE.least_strain,
+            LEAST_STRAIN,
         )
         forces = np.empty((len(cells), 24))
 
@@ -432,7 +432,7 @@ class CalibratedNetwork(Solid):
             corners, gradients, volume, springs = self._shapes
             work = cell_forces(
                 corners[half], gradients[half], volume[half], springs,
-                shear, bulk, knots, cubic, STRESS_CURVE.least_strain,
+                shear, bulk, knots, cubic, LEAST_STRAIN,
                 self.cells[half], displacement, residuals[half], internal,
             )  # fmt: skip
             return internal, work

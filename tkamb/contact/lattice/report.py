@@ -6,7 +6,7 @@ In a contact too narrow for the cells, the peak is an average over an area large
 """
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Literal
 
@@ -27,32 +27,24 @@ from tkamb.contact.result import ContactResult, ContactStatus, medial_points
 from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.units import DEGREE, MILLIMETRE
 
-
-@dataclass(frozen=True)
-class LatticeFlagSettings:
-    """When a result of the lattice gets a flag."""
-
-    edge_distance_cells: float = 2.0
-    """Cells: distance from the peak at which the femoral normal is evaluated. Chosen because a peak
-    at an edge lies one or two cells inside it."""
-    least_edge_distance: float = 2.0 * MILLIMETRE
-    """m: smallest distance from the peak at which the femoral normal is evaluated. Chosen because
-    an edge of 6 mm radius then counts as an edge with fine cells too."""
-    sharp_edge_angle: float = 20.0 * DEGREE
-    """rad: a peak is flagged if the femoral normal turns by more over that distance. Chosen because
-    a radius of 6 cells turns by this angle."""
-    strain_flag: float = -0.4
-    """1: a result with a smaller principal strain is flagged. Chosen because the material law does
-    not prevent strains below -1, and measured curves end before -0.4."""
-    max_unseen_height: float = 0.2e-3
-    """m: a press is flagged if its travel from first touch to the first contact node is larger.
-    Chosen because the nodes of 3 mm cells miss the bottom of a ball of 15 mm radius by 0.15 mm."""
-    collapse_strain: float = -1.0
-    """1: principal strain at which a cell has no thickness left. The result is then out of range.
-    By definition of the strain."""
-
-
-LATTICE_FLAG = LatticeFlagSettings()
+# Cells: distance from the peak at which the femoral normal is evaluated. Chosen because a peak at
+# an edge lies one or two cells inside it.
+EDGE_DISTANCE_CELLS = 2.0
+# m: smallest distance from the peak at which the femoral normal is evaluated. Chosen because an
+# edge of 6 mm radius then counts as an edge with fine cells too.
+LEAST_EDGE_DISTANCE = 2.0 * MILLIMETRE
+# rad: a peak is flagged if the femoral normal turns by more over that distance. Chosen because a
+# radius of 6 cells turns by this angle.
+SHARP_EDGE_ANGLE = 20.0 * DEGREE
+# 1: a result with a smaller principal strain is flagged. Chosen because the material law does not
+# prevent strains below -1, and measured curves end before -0.4.
+STRAIN_FLAG = -0.4
+# m: a press is flagged if its travel from first touch to the first contact node is larger. Chosen
+# because the nodes of 3 mm cells miss the bottom of a ball of 15 mm radius by 0.15 mm.
+MAX_UNSEEN_HEIGHT = 0.2e-3
+# 1: principal strain at which a cell has no thickness left. The result is then out of range. By
+# definition of the strain.
+COLLAPSE_STRAIN = -1.0
 
 
 AROUND = np.array([(x, 0.0, z) for x in (-1, 0, 1) for z in (-1, 0, 1)], float)
@@ -89,8 +81,8 @@ def edge_flags(
     """Return a flag for each peak that lies at an edge of the femoral component.
 
     The femoral normal at the peak is compared with eight normals around it, at a distance of
-    `LATTICE_FLAG.edge_distance_cells` or `LATTICE_FLAG.least_edge_distance`, if that is larger. A
-    turn by more than `LATTICE_FLAG.sharp_edge_angle` is an edge, and so is the end of the surface.
+    `EDGE_DISTANCE_CELLS` or `LEAST_EDGE_DISTANCE`, if that is larger. A
+    turn by more than `SHARP_EDGE_ANGLE` is an edge, and so is the end of the surface.
 
     Args:
         femoral: femoral component seen from below.
@@ -98,9 +90,7 @@ def edge_flags(
         spacing: edges of a cell, m, shape (3,).
         peaks: point of the peak pressure by side, m, insert frame, shape (3,) each.
     """
-    distance = np.maximum(
-        LATTICE_FLAG.edge_distance_cells * spacing, LATTICE_FLAG.least_edge_distance
-    )
+    distance = np.maximum(EDGE_DISTANCE_CELLS * spacing, LEAST_EDGE_DISTANCE)
     # All eight directions have the same length.
     around = AROUND / np.maximum(np.linalg.norm(AROUND, axis=1), 1.0)[:, None] * distance
     sites = (np.array(list(peaks.values())).reshape(-1, 1, 3) + around).reshape(-1, 3)
@@ -121,7 +111,7 @@ def _sharpness(normals: NDArray[np.float64]) -> str:
     # The middle row is the normal at the peak itself.
     cosine = normals @ normals[len(AROUND) // 2]
     turn = float(np.arccos(np.clip(cosine.min(), -1.0, 1.0)))
-    return f"turns by {turn / DEGREE:.0f} deg" if turn > LATTICE_FLAG.sharp_edge_angle else ""
+    return f"turns by {turn / DEGREE:.0f} deg" if turn > SHARP_EDGE_ANGLE else ""
 
 
 def strain_flags(state: LatticeState, solution: Solution) -> tuple[tuple[str, ...], bool]:
@@ -134,13 +124,9 @@ def strain_flags(state: LatticeState, solution: Solution) -> tuple[tuple[str, ..
         # A linear solution has only the displacement of the candidates.
         strains = solution.displacement[:, 1] / state.surface.thickness[solution.candidates]
         least, kind = float(strains.min(initial=0.0)), "mean strain of a column"
-    if least <= LATTICE_FLAG.collapse_strain:
+    if least <= COLLAPSE_STRAIN:
         return (f"{kind} {least:.2f}: the insert is compressed to nothing",), True
-    return (
-        (f"{kind} {least:.2f} is below {LATTICE_FLAG.strain_flag}",)
-        if least < LATTICE_FLAG.strain_flag
-        else ()
-    ), False
+    return ((f"{kind} {least:.2f} is below {STRAIN_FLAG}",) if least < STRAIN_FLAG else ()), False
 
 
 def unseen_flags(state: LatticeState, result: ContactResult, depth: float) -> Iterator[str]:
@@ -152,9 +138,7 @@ def unseen_flags(state: LatticeState, result: ContactResult, depth: float) -> It
         depth: travel of the femoral component since it touched the first contact node, m.
     """
     unseen = result.approach - depth
-    if unseen > max(
-        LATTICE_FLAG.max_unseen_height, PRESS.flagged_thickness_share * result.approach
-    ):
+    if unseen > max(MAX_UNSEEN_HEIGHT, PRESS.flagged_thickness_share * result.approach):
         yield (
             f"the meshes first touch {unseen / MILLIMETRE:.2g} mm before any node does (cells of "
             f"{state.lattice.spacing.max() / MILLIMETRE:.2g} mm); the approach counts from first "

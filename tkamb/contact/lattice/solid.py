@@ -26,17 +26,10 @@ from tkamb.errors import InputError
 from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array, Index
 
+# 1: smaller strains get the secant modulus at this strain. Chosen because stress over strain is
+# 0/0 at zero.
+LEAST_STRAIN = 1e-9
 
-@dataclass(frozen=True)
-class StressCurveSettings:
-    """The evaluation of a stress-strain curve."""
-
-    least_strain: float = 1e-9
-    """1: smaller strains get the secant modulus at this strain. Chosen because stress over strain
-    is 0/0 at zero."""
-
-
-STRESS_CURVE = StressCurveSettings()
 
 _STRAINS = np.concatenate([[0.0], np.geomspace(1e-7, 20.0, 6000)])
 
@@ -70,28 +63,22 @@ class ShearCurve:
         """Return the secant shear modulus mu_s, Pa, at equivalent strains e >= 0."""
         if self.spline is None:
             return np.full_like(equivalent, self.shear_modulus)
-        floored = np.clip(equivalent, STRESS_CURVE.least_strain, self.spline.x[-1])
+        floored = np.clip(equivalent, LEAST_STRAIN, self.spline.x[-1])
         return self.spline(floored) / (3 * floored)
 
     def softening(self, equivalent: Array) -> Array:
         """Return (d mu_s / d e) / e, Pa, at equivalent strains e >= 0; it is never positive."""
         if self.spline is None:
             return np.zeros_like(equivalent)
-        floored = np.clip(equivalent, STRESS_CURVE.least_strain, self.spline.x[-1])
+        floored = np.clip(equivalent, LEAST_STRAIN, self.spline.x[-1])
         slope = self.spline(floored, 1) / 3 - self.modulus(floored)
         # Below this strain the curve is elastic, and the quotient would be rounding error.
         return np.where(equivalent < 1e-7, 0.0, slope / floored**2)
 
 
-@dataclass(frozen=True)
-class SolidSettings:
-    """The elements of a lattice."""
+# Number of cells whose matrices are in memory at once. Chosen because they take 9 MB.
+CELLS_AT_ONCE = 2000
 
-    cells_at_once: int = 2000
-    """Number of cells whose matrices are in memory at once. Chosen because they take 9 MB."""
-
-
-SOLID = SolidSettings()
 
 DEVIATORIC = np.diag([2.0, 2.0, 2.0, 1.0, 1.0, 1.0])
 DEVIATORIC[:3, :3] -= 2 / 3
@@ -350,9 +337,9 @@ class Solid(ABC):
 
 
 def chunks(count: int) -> Iterator[slice]:
-    """Yield slices of at most `SOLID.cells_at_once` cells."""
-    for first in range(0, count, SOLID.cells_at_once):
-        yield slice(first, min(first + SOLID.cells_at_once, count))
+    """Yield slices of at most `CELLS_AT_ONCE` cells."""
+    for first in range(0, count, CELLS_AT_ONCE):
+        yield slice(first, min(first + CELLS_AT_ONCE, count))
 
 
 def strain_matrix(gradients: Array) -> Array:

@@ -4,33 +4,24 @@ On one clock the centre of pressure of a loaded foot lies under the foot's marke
 lies where the foot is at another time.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
-from tkamb.io.importing.plates import FOOT_CONTACT, Feet, RecordedForce
+from tkamb.io.importing.plates import MAX_FOOT_DISTANCE, Feet, RecordedForce
 
-
-@dataclass(frozen=True)
-class ClockSettings:
-    """How a shift between two clocks is found."""
-
-    percentile: float = 95.0
-    """%: share of the loaded samples that must lie under the foot. Chosen because a few samples at
-    foot strike and toe-off have a noisy centre of pressure."""
-    samples: int = 400
-    """Number of loaded samples that are compared. Chosen because they are dense in one stance."""
-    share: float = 0.5
-    """1: share of the loaded samples that a shift must bring into the times of the motion. Chosen
-    because a motion may be cut out of a longer recording."""
-    step_s: float = 0.02
-    """s: step of the shifts that are tried. Chosen because a foot in stance hardly moves in it."""
-
-
-CLOCK = ClockSettings()
+# %: share of the loaded samples that must lie under the foot. Chosen because a few samples at foot
+# strike and toe-off have a noisy centre of pressure.
+PERCENTILE = 95.0
+# Number of loaded samples that are compared. Chosen because they are dense in one stance.
+SAMPLES = 400
+# 1: share of the loaded samples that a shift must bring into the times of the motion. Chosen
+# because a motion may be cut out of a longer recording.
+SHARE = 0.5
+# s: step of the shifts that are tried. Chosen because a foot in stance hardly moves in it.
+STEP_S = 0.02
 
 
 def check_clocks(forces: list[RecordedForce], feet: Feet, side: str, path: Path) -> None:
@@ -47,14 +38,14 @@ def check_clocks(forces: list[RecordedForce], feet: Feet, side: str, path: Path)
     if not len(time) or not np.isfinite(middle).any():
         return
     apart, share = _distance(time, point, feet.time, middle)
-    if share == 0.0 or apart <= FOOT_CONTACT.max_foot_distance:
+    if share == 0.0 or apart <= MAX_FOOT_DISTANCE:
         return
     starts = [feet.time[0] - force.time[0] for force in forces]
     length = float(np.ptp(feet.time))
-    shifts = [*starts, *np.arange(-length, length, CLOCK.step_s) - (time[0] - feet.time[0])]
+    shifts = [*starts, *np.arange(-length, length, STEP_S) - (time[0] - feet.time[0])]
     for shift in shifts:
         moved, share = _distance(time + shift, point, feet.time, middle)
-        if share > CLOCK.share and moved <= FOOT_CONTACT.max_foot_distance:
+        if share > SHARE and moved <= MAX_FOOT_DISTANCE:
             raise InputError(
                 f"its centres of pressure lie up to {apart:.3g} m from the {side} foot, but under "
                 f"it if {shift:+.3f} s is added to the times: force and motion are on two clocks",
@@ -68,7 +59,7 @@ def _loaded_points(forces: list[RecordedForce]) -> tuple[Array, Array]:
     times = [force.time[force.loaded] for force in forces]
     points = [force.point[force.loaded] for force in forces]
     time, point = np.concatenate(times), np.concatenate(points)
-    every = max(len(time) // CLOCK.samples, 1)
+    every = max(len(time) // SAMPLES, 1)
     return time[::every], point[::every]
 
 
@@ -89,4 +80,4 @@ def _distance(time: Array, point: Array, clock: Array, middle: Array) -> tuple[f
         return np.inf, 0.0
     foot = [np.interp(time[inside], clock[seen], middle[seen, k]) for k in (0, 2)]
     apart = np.hypot(point[inside, 0] - foot[0], point[inside, 2] - foot[1])
-    return float(np.percentile(apart, CLOCK.percentile)), float(inside.mean())
+    return float(np.percentile(apart, PERCENTILE)), float(inside.mean())

@@ -28,7 +28,7 @@ from tkamb.io.importing.plates import (
 from tkamb.io.importing.request import ImportRequest
 from tkamb.io.importing.scene_text import GroundFile
 from tkamb.io.recordings.c3d import read_c3d
-from tkamb.io.recordings.force_plates import PLATE_LOAD, around_load, unloaded_level
+from tkamb.io.recordings.force_plates import DRIFT_N, around_load, unloaded_level
 from tkamb.io.recordings.ground_reaction import (
     recorded_wrench,
     summed_reaction,
@@ -36,17 +36,10 @@ from tkamb.io.recordings.ground_reaction import (
 from tkamb.io.recordings.recording_tables import GroundReactionTable
 from tkamb.io.recordings.tables import Table, read_table
 
+# N: below this vertical force the centre of pressure is interpolated in time. Chosen because the
+# quotient of moment and force is noise below 40 N.
+HOLD_BELOW = 40.0
 
-@dataclass(frozen=True)
-class ImportedForceSettings:
-    """Settings of the ground reaction in an imported scene."""
-
-    hold_below: float = 40.0
-    """N: below this vertical force the centre of pressure is interpolated in time. Chosen because
-    the quotient of moment and force is noise below 40 N."""
-
-
-IMPORTED_FORCE = ImportedForceSettings()
 
 COLUMNS = ("time", *(f"{kind}_{k}" for kind in ("force", "point", "moment") for k in (1, 2, 3)))
 """Columns of a table of summed forces: time (s), force (N), point of application (m), and moment
@@ -231,7 +224,7 @@ def _recorded(table: Table, force: TableForce, axes: str) -> RecordedForce:
         length_unit="m",
         laboratory_axes=axes,
         cutoff_Hz="none",
-        unloaded_N=IMPORTED_FORCE.hold_below,
+        unloaded_N=HOLD_BELOW,
     )
     time, wrench, level = recorded_wrench(source)
     loaded = around_load(np.linalg.norm(wrench[:, :3], axis=1), time)
@@ -263,7 +256,7 @@ def _summed(recorded: list[RecordedForce], path: Path) -> str:
         loaded = around_load(np.linalg.norm(source.wrench[:, :3], axis=1), time)
         wrenches.append(np.where(loaded[:, None], source.wrench, 0.0))
     level = float(np.mean(levels))
-    point, moment, force = summed_reaction(time, wrenches, level, IMPORTED_FORCE.hold_below, path)
+    point, moment, force = summed_reaction(time, wrenches, level, HOLD_BELOW, path)
     rows = np.column_stack([time, force, point, moment])
     lines = [",".join(f"{value:.9g}" for value in row) for row in rows]
     return "\n".join([",".join(COLUMNS), *lines, ""])
@@ -344,7 +337,7 @@ def _drift_lines(forces: list[RecordedForce], plates: tuple[int | str, ...]) -> 
         f"ATTENTION: {force.title} reads {force.drift:.1f} N while nobody stands on it: it drifts, "
         "and its force under the foot is too large by that amount"
         for force in forces
-        if force.key in plates and abs(force.drift) > PLATE_LOAD.drift_N
+        if force.key in plates and abs(force.drift) > DRIFT_N
     ]
 
 

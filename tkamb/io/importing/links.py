@@ -24,17 +24,9 @@ from tkamb.io.recordings.patient import RigidInertia, combined
 from tkamb.io.recordings.urdf_check import KNEE_JOINTS, PATELLA_JOINTS
 from tkamb.units import DEGREE
 
-
-@dataclass(frozen=True)
-class LinkFitSettings:
-    """Limits on the pose of the implant on the bones of an OpenSim model."""
-
-    max_implant_rotation: float = 35.0 * DEGREE
-    """rad: largest rotation between the axes of implant and bone. Chosen because wrong mesh axes
-    give at least 90 deg and a real implantation gives a few degrees."""
-
-
-LINK_FIT = LinkFitSettings()
+# rad: largest rotation between the axes of implant and bone. Chosen because wrong mesh axes give
+# at least 90 deg and a real implantation gives a few degrees.
+MAX_IMPLANT_ROTATION = 35.0 * DEGREE
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +227,7 @@ def _anatomical(
     pose = leg.in_body(frame.body, body) @ frame.pose @ inverse(turn)
     nearest, _ = quarter_turn(pose[:3, :3])
     angle = Rotation.from_matrix(pose[:3, :3]).magnitude()
-    if not np.allclose(nearest, np.eye(3)) or angle > LINK_FIT.max_implant_rotation:
+    if not np.allclose(nearest, np.eye(3)) or angle > MAX_IMPLANT_ROTATION:
         raise InputError(
             f"the {part} is rotated by {angle / DEGREE:.0f} deg on '{body}' with these axes "
             f"({frame.why})",

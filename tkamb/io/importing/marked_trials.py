@@ -1,7 +1,7 @@
 """Markers of several trials of one subject, and the scene with registered markers."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,28 +14,20 @@ from tkamb.io.importing.registration import Registration, misfit, register
 from tkamb.io.importing.request import ImportRequest
 from tkamb.io.importing.scene_text import SceneText
 from tkamb.io.recordings.laboratory import laboratory_rotation
-from tkamb.io.recordings.markers import MARKER_FIT, marker_trajectories, matched_labels
+from tkamb.io.recordings.markers import MAX_MEDIAN_RESIDUAL, marker_trajectories, matched_labels
 from tkamb.io.recordings.tables import Table, read_table, with_unit
 from tkamb.units import DEGREE, MILLIMETRE
 
-
-@dataclass(frozen=True)
-class TrialMatchSettings:
-    """Which trials are registered, and which markers of other trials count."""
-
-    misfit: float = 10.0 * MILLIMETRE
-    """m: a trial is registered by default if its markers misfit the model by more (root mean square
-    of the rigid fits of shank and thigh). Chosen because markers that a standing trial has placed
-    misfit by 2 to 5 mm, and those of a model of another session by 20 mm and more."""
-    knee_distance: float = 20.0 * MILLIMETRE
-    """m: likewise for the median distance of the knee centres of shank and thigh. Chosen because
-    frames of a run with a larger distance are flagged."""
-    moved: float = 10.0 * MILLIMETRE
-    """m: a marker sits elsewhere in another trial if its distances to the others of its segment
-    differ by more. Chosen because skin changes them by less than 6 mm in walks and squats."""
-
-
-TRIAL_MATCH = TrialMatchSettings()
+# m: a trial is registered by default if its markers misfit the model by more (root mean square of
+# the rigid fits of shank and thigh). Chosen because markers that a standing trial has placed
+# misfit by 2 to 5 mm, and those of a model of another session by 20 mm and more.
+MISFIT = 10.0 * MILLIMETRE
+# m: likewise for the median distance of the knee centres of shank and thigh. Chosen because frames
+# of a run with a larger distance are flagged.
+KNEE_DISTANCE = 20.0 * MILLIMETRE
+# m: a marker sits elsewhere in another trial if its distances to the others of its segment differ
+# by more. Chosen because skin changes them by less than 6 mm in walks and squats.
+MOVED = 10.0 * MILLIMETRE
 
 
 def with_registered_markers(
@@ -58,8 +50,8 @@ def with_registered_markers(
     segments = list(scene.markers.segments)
     own = measured_markers(request.recording, request, segments, scene.markers.axes)
     rms, apart = misfit(links, segments, own)
-    poor = rms > TRIAL_MATCH.misfit or apart > TRIAL_MATCH.knee_distance
-    if rms > MARKER_FIT.max_median_residual:
+    poor = rms > MISFIT or apart > KNEE_DISTANCE
+    if rms > MAX_MEDIAN_RESIDUAL:
         return scene, None, []  # loading the scene refuses the wrong unit or label
     if not (poor or request.companions if request.register is None else request.register):
         return scene, None, []
@@ -127,7 +119,7 @@ def moved_markers(
         for k, label in enumerate(segment.points):
             change = np.sort(np.abs(np.delete(here[k] - there[k], k)))
             change = change[np.isfinite(change)]
-            if len(change) and change[(len(change) - 1) // 2] > TRIAL_MATCH.moved:
+            if len(change) and change[(len(change) - 1) // 2] > MOVED:
                 moved.append(label)
         gone = [k for k, label in enumerate(segment.points) if label in moved]
         other[segment.name][:, gone] = np.nan

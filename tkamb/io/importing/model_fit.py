@@ -6,7 +6,6 @@ coordinates are not imposed. This module computes residuals and derivatives.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -21,20 +20,12 @@ from tkamb.io.recordings.laboratory import laboratory_rotation
 from tkamb.io.recordings.markers import marker_trajectories, matched_labels
 from tkamb.io.recordings.tables import Table
 
-
-@dataclass(frozen=True)
-class ModelFitSettings:
-    """Settings of the fit of a model to markers."""
-
-    block_frames: int = 128
-    """Number of frames that are fitted in one call. It does not change the result. Chosen because
-    the arrays then fit into the processor's cache."""
-    coarse_stride: int = 8
-    """frames: every `coarse_stride`-th frame is fitted first. Interpolation between these poses
-    gives the initial guesses of the other frames. Chosen freely: it changes only these guesses."""
-
-
-MODEL_FIT = ModelFitSettings()
+# Number of frames that are fitted in one call. It does not change the result. Chosen because the
+# arrays then fit into the processor's cache.
+BLOCK_FRAMES = 128
+# frames: every `COARSE_STRIDE`-th frame is fitted first. Interpolation between these poses gives
+# the initial guesses of the other frames. Chosen freely: it changes only these guesses.
+COARSE_STRIDE = 8
 
 
 class ModelChain:
@@ -270,9 +261,7 @@ def fit_model(
     begin = fit_chain(chain, measured[first : first + 1], values, chain.default(1))
     # The frame with most visible markers is the initial guess of every `coarse_stride`-th frame.
     # Interpolation between those frames gives the initial guesses of the others.
-    coarse = np.unique(
-        np.append(np.arange(0, len(measured), MODEL_FIT.coarse_stride), len(measured) - 1)
-    )
+    coarse = np.unique(np.append(np.arange(0, len(measured), COARSE_STRIDE), len(measured) - 1))
     start = np.tile(begin.state, (len(coarse), 1))
     knots = fit_in_blocks(chain, measured[coarse], values, start).state
     between = CubicSpline(coarse, knots)(np.arange(len(measured))) if len(coarse) > 2 else start
@@ -283,10 +272,7 @@ def fit_in_blocks(
     chain: ModelChain, measured: Array, weights: Array, start: Array
 ) -> ChainFit[Array]:
     """Return the fit of many frames, computed in blocks of `block_frames`."""
-    parts = [
-        slice(k, k + MODEL_FIT.block_frames)
-        for k in range(0, len(measured), MODEL_FIT.block_frames)
-    ]
+    parts = [slice(k, k + BLOCK_FRAMES) for k in range(0, len(measured), BLOCK_FRAMES)]
     fits = [fit_chain(chain, measured[part], weights, start[part]) for part in parts]
     state, rms, distance, solved = (
         np.concatenate([getattr(fit, name) for fit in fits])

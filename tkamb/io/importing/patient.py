@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from tkamb.errors import InputError
-from tkamb.files import CHOOSE_OUT, FILE_LIMITS, claim_directory, read_bytes, write_new_text
+from tkamb.files import CHOOSE_OUT, TABLE_BYTES, claim_directory, read_bytes, write_new_text
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.surface import Surface
 from tkamb.io.importing.anatomy import Leg, find_leg
@@ -36,26 +36,19 @@ from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import Case, load_case
 from tkamb.units import DEGREE, MILLIMETRE
 
+# A model is of one leg if thigh, shank and foot have more than this share of its mass. Chosen
+# because one leg has less than a fifth of a whole body's mass.
+ONE_LEG_SHARE = 0.6
+# Share of the body's mass in one leg, from thigh 0.100, shank 0.0465 and foot 0.0145 (Winter,
+# Biomechanics, 2009).
+LEG_MASS_SHARE = 0.161
+# The report of an import gives reasons for at most this number of unreadable parts. Chosen to keep
+# the report short.
+MAX_REASONS = 3
+# The model is not scaled if its mass differs from the subject's by less than this share. Chosen
+# because such a difference may come from clothes and rounding.
+SAME_MASS_SHARE = 0.01
 
-@dataclass(frozen=True)
-class ModelMassSettings:
-    """Scaling of an OpenSim model's mass to a patient."""
-
-    one_leg_share: float = 0.6
-    """A model is of one leg if thigh, shank and foot have more than this share of its mass.
-    Chosen because one leg has less than a fifth of a whole body's mass."""
-    leg_mass_share: float = 0.161
-    """Share of the body's mass in one leg, from thigh 0.100, shank 0.0465 and foot 0.0145
-    (Winter, Biomechanics, 2009)."""
-    max_reasons: int = 3
-    """The report of an import gives reasons for at most this number of unreadable parts. Chosen
-    to keep the report short."""
-    same_mass_share: float = 0.01
-    """The model is not scaled if its mass differs from the subject's by less than this share.
-    Chosen because such a difference may come from clothes and rounding."""
-
-
-MODEL_MASS = ModelMassSettings()
 
 LEG_SHARES = (0.10, 0.25)
 """Smallest and largest accepted share of one leg in the body's mass. Winter (2009) gives 0.161, de
@@ -283,7 +276,7 @@ def _same_there(path: Path, text: str) -> bool:
     if not os.path.lexists(path):
         return False
     with suppress(InputError):
-        if read_bytes(path, FILE_LIMITS.table_bytes) == text.encode("utf-8", "backslashreplace"):
+        if read_bytes(path, TABLE_BYTES) == text.encode("utf-8", "backslashreplace"):
             return True
     what = "exists already with another content; another scene may need it"
     raise InputError(what, path, CHOOSE_OUT)
@@ -333,13 +326,11 @@ def _mass_scale(request: ImportRequest, leg: Leg) -> tuple[float, str]:
         raise InputError(
             "gives thigh, shank and foot no mass", request.model, "give its bodies their masses"
         )
-    if leg_mass > MODEL_MASS.one_leg_share * model:
+    if leg_mass > ONE_LEG_SHARE * model:
         return _leg_scale(request, leg_mass)
     ratio = subject / model
     scaled = (
-        abs(ratio - 1.0) > MODEL_MASS.same_mass_share
-        if request.scale_mass is None
-        else request.scale_mass
+        abs(ratio - 1.0) > SAME_MASS_SHARE if request.scale_mass is None else request.scale_mass
     )
     text = f"mass: the model's bodies sum to {model:.2f} kg, the subject is {subject:g} kg: "
     if not 0.5 < ratio < 2.0:
@@ -355,7 +346,7 @@ def _leg_scale(request: ImportRequest, leg_mass: float) -> tuple[float, str]:
     """Return the factor on the masses of a model of one leg, and a remark on it.
 
     Such a model has the mass of a leg, or of the whole body if a scaling tool scaled it to the
-    subject's mass. If the factor is not 1, the leg gets the share `MODEL_MASS.leg_mass_share` of
+    subject's mass. If the factor is not 1, the leg gets the share `LEG_MASS_SHARE` of
     the subject's mass.
 
     Args:
@@ -366,7 +357,7 @@ def _leg_scale(request: ImportRequest, leg_mass: float) -> tuple[float, str]:
         InputError: the model has neither a leg's nor a whole body's mass.
     """
     subject = request.mass_kg
-    share, target = leg_mass / subject, MODEL_MASS.leg_mass_share * subject
+    share, target = leg_mass / subject, LEG_MASS_SHARE * subject
     low, high = LEG_SHARES
     whole_body = 0.5 < share < 2.0
     text = (
@@ -385,8 +376,7 @@ def _leg_scale(request: ImportRequest, leg_mass: float) -> tuple[float, str]:
         )
     why = ", the whole body's" if whole_body else ""
     return target / leg_mass, (
-        f"{text}{why}: scaled to {target:.2f} kg, "
-        f"the {MODEL_MASS.leg_mass_share:.1%} of a leg (Winter 2009)"
+        f"{text}{why}: scaled to {target:.2f} kg, the {LEG_MASS_SHARE:.1%} of a leg (Winter 2009)"
     )
 
 
@@ -396,7 +386,7 @@ def _model_lines(model: OpenSimModel) -> list[str]:
     unread = [f"{element.kind} '{element.name}'" for element in model.unread]
     if unread:
         lines.append(f"not read, and not needed for this knee: {some_names(unread)}")
-        lines += [f"  {element.reason}" for element in model.unread[: MODEL_MASS.max_reasons]]
+        lines += [f"  {element.reason}" for element in model.unread[:MAX_REASONS]]
     return lines
 
 

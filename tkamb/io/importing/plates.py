@@ -164,33 +164,26 @@ def _kind_of_words(stem: str) -> str | None:
     return None
 
 
-@dataclass(frozen=True)
-class FootContactSettings:
-    """Assignment of the loads on force plates to the feet, from forces and markers."""
-
-    min_force: float = 40.0
-    """N: a plate is loaded above this vertical force. Chosen because the noise of a plate is a few
-    newtons."""
-    min_duration: float = 0.1
-    """s: a shorter load is not a step. Chosen because shorter loads are knocks on the plate."""
-    max_foot_distance: float = 0.25
-    """m: largest horizontal distance from the centre of pressure to the mean position of the foot's
-    markers. Chosen because a foot is about this long."""
-    min_step_height: float = 0.15
-    """m: a foot stands on a step if its markers are higher above the plate than this. Chosen
-    because the lowest stair of the data sets is 0.17 m high."""
-    marker_height: float = 0.055
-    """m: mean height of a foot's markers above the surface under the foot. Chosen because it is a
-    usual value on level ground."""
-    same_height: float = 0.05
-    """m: two surfaces with a smaller difference in height are one step. Chosen because the steps of
-    stairs differ by more."""
-    max_standing_speed: float = 0.15
-    """m/s: a foot off the plates that is slower than this may stand on an unmeasured surface.
-    Chosen because a swinging foot is faster."""
-
-
-FOOT_CONTACT = FootContactSettings()
+# N: a plate is loaded above this vertical force. Chosen because the noise of a plate is a few
+# newtons.
+MIN_FORCE = 40.0
+# s: a shorter load is not a step. Chosen because shorter loads are knocks on the plate.
+MIN_DURATION = 0.1
+# m: largest horizontal distance from the centre of pressure to the mean position of the foot's
+# markers. Chosen because a foot is about this long.
+MAX_FOOT_DISTANCE = 0.25
+# m: a foot stands on a step if its markers are higher above the plate than this. Chosen because
+# the lowest stair of the data sets is 0.17 m high.
+MIN_STEP_HEIGHT = 0.15
+# m: mean height of a foot's markers above the surface under the foot. Chosen because it is a usual
+# value on level ground.
+MARKER_HEIGHT = 0.055
+# m: two surfaces with a smaller difference in height are one step. Chosen because the steps of
+# stairs differ by more.
+SAME_HEIGHT = 0.05
+# m/s: a foot off the plates that is slower than this may stand on an unmeasured surface. Chosen
+# because a swinging foot is faster.
+MAX_STANDING_SPEED = 0.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,14 +218,14 @@ class RecordedForce:
     @property
     def loaded(self) -> np.ndarray:
         """(k,) whether the surface is loaded."""
-        return np.asarray(self.wrench[:, 1] - self.drift > FOOT_CONTACT.min_force)
+        return np.asarray(self.wrench[:, 1] - self.drift > MIN_FORCE)
 
     @property
     def pushes_down(self) -> bool:
         """Whether the vertical force points down while the surface is loaded."""
-        down = self.wrench[:, 1] < -FOOT_CONTACT.min_force
+        down = self.wrench[:, 1] < -MIN_FORCE
         step = float(np.median(np.diff(self.time))) if len(self.time) > 1 else 0.0
-        long_enough = down.sum() * step >= FOOT_CONTACT.min_duration
+        long_enough = down.sum() * step >= MIN_DURATION
         return bool(long_enough and down.sum() > self.loaded.sum())
 
     @property
@@ -320,7 +313,7 @@ def feet_loads(forces: list[RecordedForce], feet: Feet) -> list[Load]:
         middles = {s: _interpolated(m, feet.time, source.time) for s, m in feet.middles.items()}
         point = source.point
         for first, last in uninterrupted_runs(source.loaded):
-            if source.time[last] - source.time[first] >= FOOT_CONTACT.min_duration:
+            if source.time[last] - source.time[first] >= MIN_DURATION:
                 part = slice(first, last + 1)
                 positions = {side: middle[part] for side, middle in middles.items()}
                 line = (source.time[part], point[part], source.wrench[part, :3])
@@ -336,15 +329,13 @@ def _load(
     for side, middle in middles.items():
         above = middle[:, 1] - point[:, 1]
         height = float(np.nanmedian(above)) if np.isfinite(above).any() else 0.0
-        surface[side] = (
-            height - FOOT_CONTACT.marker_height if height > FOOT_CONTACT.min_step_height else 0.0
-        )
+        surface[side] = height - MARKER_HEIGHT if height > MIN_STEP_HEIGHT else 0.0
         place = point + force / force[:, 1:2] * surface[side]
         distance = np.linalg.norm((place - middle)[:, [0, 2]], axis=1)
         distances[side] = float(np.nanmedian(distance)) if np.isfinite(distance).any() else np.nan
     nearest = min(distances, key=lambda side: np.nan_to_num(distances[side], nan=np.inf))
     others = [distance for side, distance in distances.items() if side != nearest]
-    foot = nearest if distances[nearest] < FOOT_CONTACT.max_foot_distance else ""
+    foot = nearest if distances[nearest] < MAX_FOOT_DISTANCE else ""
     start, end = float(time[0]), float(time[-1])
     distance, other = distances[nearest], others[0]
     return Load(source.key, source.title, foot, start, end, distance, other, surface[nearest])
@@ -379,7 +370,7 @@ def own_plates(
             what += (
                 f": {unknown_loads[0].title} is loaded from {unknown_loads[0].start:.2f} to "
                 f"{unknown_loads[0].end:.2f} s, but no foot's markers are within "
-                f"{FOOT_CONTACT.max_foot_distance:g} m of its centre of pressure"
+                f"{MAX_FOOT_DISTANCE:g} m of its centre of pressure"
             )
             hint = f"check --laboratory-axes and the foot's labels, or {hint}"
         raise InputError(what, path, f"{hint}, or take another trial")
@@ -411,7 +402,7 @@ def check_upward(forces: list[RecordedForce], feet: Feet, side: str) -> list[str
 def common_surface(loads: list[Load], plates: tuple[int | str, ...]) -> float:
     """Return the mean height of the step under the foot, m, or 0 if the loads' heights differ."""
     heights = [load.surface for load in loads if load.plate in plates]
-    return float(np.mean(heights)) if np.ptp(heights) < FOOT_CONTACT.same_height else 0.0
+    return float(np.mean(heights)) if np.ptp(heights) < SAME_HEIGHT else 0.0
 
 
 def known_interval(
@@ -450,7 +441,7 @@ def unmeasured(
         if load.plate in plates:
             loaded |= (time >= load.start - 0.02) & (time <= load.end + 0.02)
     inside = (time >= interval[0]) & (time <= interval[1])
-    return np.asarray(time[inside & ~loaded & (speed < FOOT_CONTACT.max_standing_speed)])
+    return np.asarray(time[inside & ~loaded & (speed < MAX_STANDING_SPEED)])
 
 
 def _middle(table: Table, labels: list[str]) -> Array:

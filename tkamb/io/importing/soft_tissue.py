@@ -8,17 +8,9 @@ from tkamb.geometry.frames import Array
 from tkamb.io.importing.links import Links, body_link
 from tkamb.io.opensim.model import OpenSimLigament, Path, PathPoint
 
-
-@dataclass(frozen=True)
-class ImportedLigamentSettings:
-    """Properties of imported ligaments that an OpenSim model does not state."""
-
-    toe_strain: float = 0.06
-    """Strain at the end of the toe region of the law "quadratic-toe": twice the 0.03 of
-    Blankevoort (1991)."""
-
-
-IMPORTED_LIGAMENT = ImportedLigamentSettings()
+# Strain at the end of the toe region of the law "quadratic-toe": twice the 0.03 of Blankevoort
+# (1991).
+TOE_STRAIN = 0.06
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,11 +164,8 @@ def _omission_reason(ligament: OpenSimLigament, fixed: int) -> str:
         return "which have more than two path points"
     if ligament.stiffness_N is None:
         return f"of class {ligament.kind}, whose law the scene does not have"
-    if (
-        ligament.transition_strain is None
-        or abs(ligament.transition_strain - IMPORTED_LIGAMENT.toe_strain) > 1e-6
-    ):
-        return f"whose toe does not end at a strain of {IMPORTED_LIGAMENT.toe_strain}"
+    if ligament.transition_strain is None or abs(ligament.transition_strain - TOE_STRAIN) > 1e-6:
+        return f"whose toe does not end at a strain of {TOE_STRAIN}"
     return ""
 
 

@@ -123,16 +123,9 @@ def calibrated_markers(
     return result
 
 
-@dataclass(frozen=True)
-class TrialFrameSettings:
-    """Number of frames of a trial in an imported scene."""
-
-    frames_per_period: float = 5.0
-    """Number of frames per period of the cut-off frequency. Chosen because a motion that is
-    low-pass-filtered at this frequency changes little between two such frames."""
-
-
-TRIAL_FRAMES = TrialFrameSettings()
+# Number of frames per period of the cut-off frequency. Chosen because a motion that is low-pass-
+# filtered at this frequency changes little between two such frames.
+FRAMES_PER_PERIOD = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,7 +295,7 @@ def _thinned(
             "choose another interval",
         )
     rate = 1.0 / float(np.median(np.diff(inside)))
-    stride = max(int(rate / (TRIAL_FRAMES.frames_per_period * cutoff_Hz) + 1e-9), 1)
+    stride = max(int(rate / (FRAMES_PER_PERIOD * cutoff_Hz) + 1e-9), 1)
     count = (len(inside) - 1) // stride + 1
     even = np.ptp(np.diff(inside)) < 1e-6
     if stride == 1 or not even or count < 8:

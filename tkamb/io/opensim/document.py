@@ -226,15 +226,9 @@ def _number_words(text: str, count: int | None) -> list[str]:
 WHAT = "OpenSim model"
 
 
-@dataclass(frozen=True)
-class DocumentSettings:
-    """Limits of reading an OpenSim file."""
+# Largest depth of files that include further files. OpenSim's own models have depth 1.
+MAX_NESTED_FILES = 5
 
-    max_nested_files: int = 5
-    """Largest depth of files that include further files. OpenSim's own models have depth 1."""
-
-
-DOCUMENT = DocumentSettings()
 
 NOT_NEEDED = ("ControllerSet", "ProbeSet", "ContactGeometrySet", "AnalysisSet")
 """Sets that tkamb does not model. Their files may be absent."""
@@ -326,7 +320,7 @@ def _replace(
     if not included.is_file() and element.tag in NOT_NEEDED:
         notices.append(f"{element.tag} is left out: its file {name} does not exist")
         return path, opened
-    if included.resolve() in opened or len(opened) > DOCUMENT.max_nested_files:
+    if included.resolve() in opened or len(opened) > MAX_NESTED_FILES:
         raise InputError("names a file that includes this one, or nests files too deep", where)
     if not included.exists():
         raise InputError(

@@ -28,31 +28,21 @@ from scipy.integrate import DOP853
 from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array
 
-
-@dataclass(frozen=True)
-class PlaneStringSettings:
-    """Initial guesses of a string around an ellipsoid, in planes through its end points."""
-
-    runge_kutta_steps: int = 6
-    """Number of Runge-Kutta steps along a geodesic. Chosen because few steps suffice: the method
-    (DOP853) has order eight."""
-    rival_share: float = 0.1
-    """A second string in a plane is also tried if its excess over the shortest is less than this
-    share of its own arc. Chosen because it may lead to the shortest geodesic."""
-    planes: int = 24
-    """Number of half planes through both points that are tried. Chosen as one every 15 deg."""
-
-
-PLANE_STRING = PlaneStringSettings()
+# Number of Runge-Kutta steps along a geodesic. Chosen because few steps suffice: the method
+# (DOP853) has order eight.
+RUNGE_KUTTA_STEPS = 6
+# A second string in a plane is also tried if its excess over the shortest is less than this share
+# of its own arc. Chosen because it may lead to the shortest geodesic.
+RIVAL_SHARE = 0.1
+# Number of half planes through both points that are tried. Chosen as one every 15 deg.
+PLANES = 24
 
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(4)
 _FINE = (
-    ((2.0 * np.arange(PLANE_STRING.runge_kutta_steps) + 1.0)[:, None] + _NODES)
-    / PLANE_STRING.runge_kutta_steps
-    - 1.0
+    ((2.0 * np.arange(RUNGE_KUTTA_STEPS) + 1.0)[:, None] + _NODES) / RUNGE_KUTTA_STEPS - 1.0
 ).ravel()
-_FINE_WEIGHTS = _WEIGHTS / PLANE_STRING.runge_kutta_steps
+_FINE_WEIGHTS = _WEIGHTS / RUNGE_KUTTA_STEPS
 _NODES, _COARSE_WEIGHTS = np.polynomial.legendre.leggauss(6)
 _COARSE, _ENDS = _NODES, np.array([-1.0, 1.0])
 """Parameters -1 to 1 of points on an arc: Gauss points of the whole arc, and the ends. `_FINE`
@@ -91,10 +81,10 @@ def planar_starts(
     lower[rows, best] = False
     others = np.where(lower, lengths, np.inf)
     other = others.argmin(axis=1)
-    rival = others[rows, other] - lengths[rows, best] < PLANE_STRING.rival_share * arcs[rows, other]
+    rival = others[rows, other] - lengths[rows, best] < RIVAL_SHARE * arcs[rows, other]
     chosen = np.column_stack([best, other])
     speeds = planes.chosen(rows[:, None], chosen).speeds(_FINE, axes)
-    pieces = speeds.reshape(len(p), 2, PLANE_STRING.runge_kutta_steps, -1) @ _FINE_WEIGHTS
+    pieces = speeds.reshape(len(p), 2, RUNGE_KUTTA_STEPS, -1) @ _FINE_WEIGHTS
     return points[rows[:, None], chosen, 0], pieces, rival
 
 
@@ -128,7 +118,7 @@ class _Planes:
         spare = spare - dot(spare, along)[:, None] * along
         first = unit(np.where(offset[:, None] > 1e-9, middle, spare))
         second = np.cross(along, first)
-        angles = 2.0 * np.pi * np.arange(PLANE_STRING.planes)[:, None] / PLANE_STRING.planes
+        angles = 2.0 * np.pi * np.arange(PLANES)[:, None] / PLANES
         outward = np.cos(angles) * first[:, None] + np.sin(angles) * second[:, None]
         height = offset[:, None] * np.cos(angles[:, 0])
         radius = np.sqrt(np.maximum(1.0 - (offset[:, None] * np.sin(angles[:, 0])) ** 2, 1e-12))
@@ -190,21 +180,14 @@ def unit(vectors: Array) -> Array:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
-@dataclass(frozen=True)
-class GeodesicSettings:
-    """Newton iteration for the taut string over an ellipsoid."""
-
-    max_iterations: int = 30
-    """Largest number of Newton steps. Chosen because strings that converge need fewer."""
-    tolerance: float = 1e-11
-    """rad: the iteration has converged if the error of the string's direction at its end is
-    smaller. Chosen because the touching points then do not change noticeably."""
-    overshoot_below: float = 0.05
-    """rad: a geodesic that ends beyond its touching point is shortened if its direction error is
-    smaller than this. Chosen because the derivative may have the wrong sign at larger errors."""
-
-
-GEODESIC = GeodesicSettings()
+# Largest number of Newton steps. Chosen because strings that converge need fewer.
+MAX_ITERATIONS = 30
+# rad: the iteration has converged if the error of the string's direction at its end is smaller.
+# Chosen because the touching points then do not change noticeably.
+TOLERANCE = 1e-11
+# rad: a geodesic that ends beyond its touching point is shortened if its direction error is
+# smaller than this. Chosen because the derivative may have the wrong sign at larger errors.
+OVERSHOOT_BELOW = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,7 +268,7 @@ def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) 
     limit = 0.3 * axes.max()
     entry, leave = np.empty_like(start), np.empty_like(start)
     active = np.arange(len(p))
-    for _ in range(GEODESIC.max_iterations):
+    for _ in range(MAX_ITERATIONS):
         angles = angle[active]
         shot = _Shot(
             start[active], end[active], axes, hub[active], radial[active], sideways[active]
@@ -294,14 +277,14 @@ def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) 
             angles, arc[active, None] * shares[active]
         )
         small = np.abs(residual).max(axis=1)
-        is_converged = (small < GEODESIC.tolerance) & (ahead > 0.0)
+        is_converged = (small < TOLERANCE) & (ahead > 0.0)
         converged[active[is_converged]] = True
         if is_converged.all():
             break
         step = -np.linalg.solve(jacobian[~is_converged], residual[~is_converged][..., None])[..., 0]
         # `ahead` is negative if the geodesic ends beyond the touching point. The overshoot is then
         # about as long as the straight part that leads back.
-        past = ((small < GEODESIC.overshoot_below) & (ahead <= 0.0))[~is_converged]
+        past = ((small < OVERSHOOT_BELOW) & (ahead <= 0.0))[~is_converged]
         step[past] = np.column_stack([np.zeros(past.sum()), 2.0 * ahead[~is_converged][past]])
         active = active[~is_converged]
         # Long steps are shortened, because derivatives far from the solution are unreliable.
@@ -309,7 +292,7 @@ def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) 
         share = np.minimum(share, limit / np.maximum(np.abs(step[:, 1]), 1e-300))
         angle[active] += share * step[:, 0]
         arc[active] = np.maximum(arc[active] + share * step[:, 1], -limit)
-    converged &= arc > -GEODESIC.tolerance
+    converged &= arc > -TOLERANCE
     straight = np.linalg.norm(entry - start, axis=1) + np.linalg.norm(end - leave, axis=1)
     return Strings(entry, leave, arc, straight + arc, converged)
 

@@ -123,19 +123,12 @@ def _cross(twist: Array, axis: Array) -> Array:
     return np.hstack([np.cross(omega, axis[:, :3]), linear])
 
 
-@dataclass(frozen=True)
-class AngleUnitSettings:
-    """Limits to distinguish angles in degrees from angles in radians."""
-
-    max_radians: float = 6.5
-    """rad: a larger joint angle cannot be in radians. Chosen because no joint exceeds a whole turn,
-    6.28, while angles in degrees are larger in most movements."""
-    min_rotation_deg: float = 0.2
-    """deg: a joint that rotates by less in a whole recording is considered fixed. Chosen because
-    the noise of a recording is about as large."""
-
-
-ANGLE_UNIT = AngleUnitSettings()
+# rad: a larger joint angle cannot be in radians. Chosen because no joint exceeds a whole turn,
+# 6.28, while angles in degrees are larger in most movements.
+MAX_RADIANS = 6.5
+# deg: a joint that rotates by less in a whole recording is considered fixed. Chosen because the
+# noise of a recording is about as large.
+MIN_ROTATION_DEG = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,13 +201,13 @@ def _angle_scale(angles: dict[str, Array], recorded: Table) -> float:
     largest = max(float(np.abs(values).max()) for values in angles.values())
     worst = max(angles, key=lambda name: np.abs(angles[name]).max())
     if recorded.in_degrees is None:
-        likely = "yes" if largest > ANGLE_UNIT.max_radians else "no (radians) or inDegrees=yes"
+        likely = "yes" if largest > MAX_RADIANS else "no (radians) or inDegrees=yes"
         raise InputError(
             f"does not say inDegrees ('{worst}' reaches {largest:.3g})",
             recorded.path,
             f"add the line inDegrees={likely} above its endheader",
         )
-    if not recorded.in_degrees and largest > ANGLE_UNIT.max_radians:
+    if not recorded.in_degrees and largest > MAX_RADIANS:
         raise InputError(
             f"says inDegrees=no, but '{worst}' reaches {largest:.4g}, which no joint does in "
             "radians",
@@ -235,8 +228,8 @@ def angle_lines(kinematics: Kinematics, recorded: Table, q: Array) -> tuple[str,
     coordinates = kinematics.model.coordinates
     angles = [kinematics.coordinates[name] for name in coordinates if coordinates[name].rotational]
     turns = np.ptp(q[:, angles], axis=0) / DEGREE
-    small = np.abs(q[:, angles]).max() < ANGLE_UNIT.max_radians * DEGREE
-    if recorded.in_degrees and small and turns.max() > ANGLE_UNIT.min_rotation_deg:
+    small = np.abs(q[:, angles]).max() < MAX_RADIANS * DEGREE
+    if recorded.in_degrees and small and turns.max() > MIN_ROTATION_DEG:
         return (
             "ATTENTION: with inDegrees=yes no joint rotates by more than "
             f"{turns.max():.2g} deg in the whole motion: check whether the file is in radians",

@@ -162,18 +162,11 @@ def _direction(start: Array, end: Array) -> tuple[Array, Array]:
     return step / np.maximum(distance, 1e-300)[:, None], distance
 
 
-@dataclass(frozen=True)
-class PathSettings:
-    """Settings of the evaluation of muscle and ligament paths."""
-
-    condition_tolerance: float = 1e-5
-    """rad or m: margin of the range of a conditional path point, as in OpenSim."""
-    block_frames: int = 256
-    """Number of frames that are evaluated in one call. It does not change the result. Chosen
-    because it limits the arrays to some tens of megabytes."""
-
-
-PATH = PathSettings()
+# rad or m: margin of the range of a conditional path point, as in OpenSim.
+CONDITION_TOLERANCE = 1e-5
+# Number of frames that are evaluated in one call. It does not change the result. Chosen because it
+# limits the arrays to some tens of megabytes.
+BLOCK_FRAMES = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,8 +265,8 @@ class LineSet:
     def _chunks(self, q: Array) -> Iterator[tuple[int, Array]]:
         """Yield, for each block of frames, the index of its first frame and coordinates (f, n)."""
         flat = q.reshape(-1, q.shape[-1])
-        for first in range(0, len(flat), PATH.block_frames):
-            yield first, flat[first : first + PATH.block_frames]
+        for first in range(0, len(flat), BLOCK_FRAMES):
+            yield first, flat[first : first + BLOCK_FRAMES]
 
     def _joined(self, q: Array, *columns: Sequence[Array]) -> list[Array]:
         """Join blocks (f, m, ...) to arrays with the leading shape of q."""
@@ -341,8 +334,8 @@ class LineSet:
             if isinstance(point, ConditionalPathPoint):
                 value = q[:, self.kinematics.coordinates[point.coordinate]]
                 low, high = point.range
-                active = (value >= low - PATH.condition_tolerance) & (
-                    value <= high + PATH.condition_tolerance
+                active = (value >= low - CONDITION_TOLERANCE) & (
+                    value <= high + CONDITION_TOLERANCE
                 )
                 follower[:, k] = np.where(active, upcoming, -1)
                 upcoming = np.where(active, k, upcoming)

@@ -8,7 +8,6 @@ contact forces, are listed in `left_out`.
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -43,26 +42,19 @@ NO_UNIT = ("unassigned", "unknown")
 metres and newtons, as always."""
 
 
-@dataclass(frozen=True)
-class ModelReadSettings:
-    """Limits on the OpenSim models that are read."""
-
-    oldest_version: int = 20302
-    """Oldest version of a file that is read, from OpenSim 2.3.2. Older files use other names."""
-    massless_below: float = 2e-14
-    """kg: a lighter body has no inertia, as in OpenSim's Body::getInertia."""
-    gravity_share: float = 0.01
-    """1: a notice names gravity that differs from standard gravity by more than this share. It
-    differs by 0.45 % at most between places at sea level."""
-    aligned: float = 1e-4
-    """rad: largest angle between gravity and an axis of ground that counts as rounding. It turns
-    0.01 % of the weight aside."""
-    longest: float = 3.0
-    """m: largest distance between joints on one body, in a file without a unit of length. Chosen
-    because no segment of a person is as long."""
-
-
-MODEL_READ = ModelReadSettings()
+# Oldest version of a file that is read, from OpenSim 2.3.2. Older files use other names.
+OLDEST_VERSION = 20302
+# kg: a lighter body has no inertia, as in OpenSim's Body::getInertia.
+MASSLESS_BELOW = 2e-14
+# 1: a notice names gravity that differs from standard gravity by more than this share. It differs
+# by 0.45 % at most between places at sea level.
+GRAVITY_SHARE = 0.01
+# rad: largest angle between gravity and an axis of ground that counts as rounding. It turns 0.01 %
+# of the weight aside.
+ALIGNED = 1e-4
+# m: largest distance between joints on one body, in a file without a unit of length. Chosen
+# because no segment of a person is as long.
+LONGEST = 3.0
 
 
 def read_osim(path: str | Path, partial: bool = False) -> OpenSimModel:
@@ -132,12 +124,12 @@ def _upright(gravity: Array, notices: list[str]) -> tuple[Array, str | None]:
     if size == 0.0:
         notices.append("its gravity is zero: y of ground is taken to point up")
         return np.eye(3), "+x,+y,+z"
-    if abs(size / STANDARD_GRAVITY - 1.0) > MODEL_READ.gravity_share:
+    if abs(size / STANDARD_GRAVITY - 1.0) > GRAVITY_SHARE:
         notices.append(f"its gravity is {size:.4g} m/s²; loads of a knee use {STANDARD_GRAVITY:g}")
     up = -gravity / size
     axis = int(np.argmax(np.abs(up)))
     nearest = np.sign(up[axis]) * np.eye(3)[axis]
-    is_aligned = np.linalg.norm(up - nearest) <= MODEL_READ.aligned
+    is_aligned = np.linalg.norm(up - nearest) <= ALIGNED
     turn = np.round(_least_turn(nearest)) if is_aligned else _least_turn(up)
     words = " ".join(f"{value:g}" for value in gravity)
     if not is_aligned:
@@ -167,7 +159,7 @@ def _check_metres(document: Document, model: Element, joints: list[Joint]) -> No
     ends = [(j.parent, j.pose_parent_frame) for j in joints]
     ends += [(j.child, j.pose_child_frame) for j in joints]
     far = max((float(np.linalg.norm(p[:3, 3])) for body, p in ends if body != GROUND), default=0.0)
-    if far > MODEL_READ.longest:
+    if far > LONGEST:
         raise InputError(
             f"has length_units '{word}', and a joint {far:.4g} from the origin of its body, "
             "which is no length in metres",
@@ -205,10 +197,9 @@ def _opened(
             f"is not an OpenSim model: its root is <{root.tag}>", path, "give an .osim file"
         )
     version = root.get("Version", "")
-    if not version.isdigit() or int(version) < MODEL_READ.oldest_version:
+    if not version.isdigit() or int(version) < OLDEST_VERSION:
         raise InputError(
-            f"has Version '{version}'; the oldest that is read is {MODEL_READ.oldest_version} "
-            "(OpenSim 2.3.2)",
+            f"has Version '{version}'; the oldest that is read is {OLDEST_VERSION} (OpenSim 2.3.2)",
             path,
             "open it in OpenSim 3.3 or 4 and save it",
         )
@@ -238,11 +229,7 @@ def _bodies(document: Document, model: Element) -> dict[str, Body]:
             centre = document.numbers(element, "mass_center", count=3, default="0 0 0")
             if mass < 0.0:
                 raise InputError(f"has a mass of {mass:g} kg", document.where(element))
-            inertia = (
-                _inertia(document, element)
-                if mass > MODEL_READ.massless_below
-                else np.zeros((3, 3))
-            )
+            inertia = _inertia(document, element) if mass > MASSLESS_BELOW else np.zeros((3, 3))
             bodies[name] = Body(name, mass, centre, inertia)
     if not bodies:
         raise InputError("has no bodies", document.path)

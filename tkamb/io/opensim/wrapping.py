@@ -36,20 +36,11 @@ from tkamb.geometry.frames import Array, Index, Mask, inverse
 from tkamb.io.opensim.geodesic import dot, shortest_strings, unit
 from tkamb.io.opensim.model import WrapObject
 
-
-@dataclass(frozen=True)
-class WrapSettings:
-    """Wrapping of a string around a single wrap object."""
-
-    ring_places: int = 48
-    """Number of angles on a torus's ring at which the string is tried. Chosen as one every 7.5
-    deg."""
-    ellipsoid_clearance: float = 1e-3
-    """Gap between a shrunken ellipsoid and the point inside the original one, as a share of the
-    ellipsoid's size. Chosen because it exceeds rounding and hardly changes a muscle's length."""
-
-
-WRAP = WrapSettings()
+# Number of angles on a torus's ring at which the string is tried. Chosen as one every 7.5 deg.
+RING_PLACES = 48
+# Gap between a shrunken ellipsoid and the point inside the original one, as a share of the
+# ellipsoid's size. Chosen because it exceeds rounding and hardly changes a muscle's length.
+ELLIPSOID_CLEARANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +193,7 @@ def _torus(start: Array, end: Array, ring: float, tube: float) -> WrapTouch:
         wrapped += np.linalg.norm(second - result.exit, axis=1)
         return result, np.where(result.touches, wrapped, -np.inf), frame
 
-    tried = 2.0 * np.pi * np.arange(WRAP.ring_places) / WRAP.ring_places
+    tried = 2.0 * np.pi * np.arange(RING_PLACES) / RING_PLACES
     lengths = np.stack([at(np.full(len(start), place))[1] for place in tried])
     low = tried[lengths.argmax(axis=0)] - tried[1]
     high = low + 2.0 * tried[1]
@@ -224,7 +215,7 @@ def _ellipsoid(
     """Return strings around an ellipsoid. A string touches if its straight line would cut it."""
     p, q = start / axes, end / axes
     depth = np.stack([np.linalg.norm(p, axis=1), np.linalg.norm(q, axis=1)], axis=1)
-    size = np.where(moves, depth / (1.0 + WRAP.ellipsoid_clearance), 1.0).min(axis=1)
+    size = np.where(moves, depth / (1.0 + ELLIPSOID_CLEARANCE), 1.0).min(axis=1)
     size = np.minimum(size, 1.0)
     step = q - p
     share = np.clip(-dot(p, step) / np.maximum(dot(step, step), 1e-300), 0.0, 1.0)
@@ -240,31 +231,24 @@ def _ellipsoid(
         arc[touches] = np.where(strings.converged, k[:, 0] * strings.arc_m, np.nan)
         first, last = (unit(v) for v in (strings.entry - a / k, second / k - strings.exit))
         growth = strings.length_m + (dot(a, first) - dot(second, last)) / k[:, 0]
-        yields = moves & (depth <= size[:, None] * (1.0 + WRAP.ellipsoid_clearance) * (1.0 + 1e-12))
+        yields = moves & (depth <= size[:, None] * (1.0 + ELLIPSOID_CLEARANCE) * (1.0 + 1e-12))
         yields &= (size < 1.0)[:, None]
         by_point = (
-            np.stack([p, q], axis=1) / (depth * (1.0 + WRAP.ellipsoid_clearance))[..., None] / axes
+            np.stack([p, q], axis=1) / (depth * (1.0 + ELLIPSOID_CLEARANCE))[..., None] / axes
         )
         push[touches] = -(growth[:, None] * yields[touches])[..., None] * by_point[touches]
     return WrapTouch(touches, entry, leave, arc, push)
 
 
-@dataclass(frozen=True)
-class StringSettings:
-    """Iteration for the taut string over several wrap objects."""
-
-    max_sweeps: int = 100
-    """Largest number of sweeps over all objects. A string that needs more fails. Chosen because
-    strings that converge need fewer."""
-    max_extrapolation: float = 10.0
-    """Largest extrapolation, as a multiple of the last step. Chosen because two sweeps do not
-    support a larger one."""
-    tolerance: float = 1e-10
-    """m: a string has converged if a sweep changes no coordinate of a touching point by more.
-    Chosen because such a change does not matter to a muscle's length."""
-
-
-STRING = StringSettings()
+# Largest number of sweeps over all objects. A string that needs more fails. Chosen because strings
+# that converge need fewer.
+MAX_SWEEPS = 100
+# Largest extrapolation, as a multiple of the last step. Chosen because two sweeps do not support a
+# larger one.
+MAX_EXTRAPOLATION = 10.0
+# m: a string has converged if a sweep changes no coordinate of a touching point by more. Chosen
+# because such a change does not matter to a muscle's length.
+TOLERANCE = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -312,13 +296,13 @@ def strings_over(
     active = np.arange(len(start))
     point, order = strings.places(), strings.order.copy()
     value = residual = np.full_like(point, np.nan)
-    for _ in range(STRING.max_sweeps):
+    for _ in range(MAX_SWEEPS):
         strings.sweep(active, allowed)
         same = (strings.order == order).all(axis=1)
         order, (last_value, last_residual) = strings.order.copy(), (value, residual)
         value = strings.places()
         residual = np.where(same[:, None], value - point, np.nan)
-        active = active[~(np.abs(residual[active]).max(axis=1) < STRING.tolerance)]
+        active = active[~(np.abs(residual[active]).max(axis=1) < TOLERANCE)]
         if not len(active):
             break
         point = value.copy()
@@ -337,7 +321,7 @@ def _leap(value: Array, last_value: Array, residual: Array, last_residual: Array
     change = residual - last_residual
     squared = np.maximum((change**2).sum(axis=1), 1e-300)
     share = (residual * change).sum(axis=1) / squared
-    sound = np.abs(share) < STRING.max_extrapolation
+    sound = np.abs(share) < MAX_EXTRAPOLATION
     leap = -np.where(sound, share, 0.0)[:, None] * (value - last_value)
     return np.where(sound[:, None], leap, 0.0)
 

@@ -20,22 +20,15 @@ from pathlib import Path
 import numpy as np
 
 from tkamb.errors import InputError, names_near
-from tkamb.files import FILE_LIMITS, read_bytes
+from tkamb.files import TABLE_BYTES, read_bytes
 from tkamb.geometry.frames import Array
 from tkamb.io.recordings.c3d_file import EXPORT, C3dFile, Parameters, parse_c3d
 from tkamb.io.recordings.force_plates import CHANNELS, ForcePlate, PlateRecord, force_plate
 from tkamb.io.recordings.unit_words import GivenUnits, metres
 
+# Largest measured value in any unit. A larger value is damaged and becomes a gap.
+MAX_VALUE = 1e12
 
-@dataclass(frozen=True)
-class C3dValueSettings:
-    """Which values of a C3D file are measurements."""
-
-    max_value: float = 1e12
-    """Largest measured value in any unit. A larger value is damaged and becomes a gap."""
-
-
-C3D_VALUE = C3dValueSettings()
 
 PLATE_PARAMETERS = ("USED", "TYPE", "CORNERS", "ORIGIN", "CHANNEL", "ZERO", "CAL_MATRIX", "UNITS")
 """Parameters of the group FORCE_PLATFORM that are understood."""
@@ -176,7 +169,7 @@ def read_c3d(path: str | Path, units: GivenUnits | None = None) -> Recording:
 def _read(path: Path, changed: int, units: GivenUnits) -> Recording:
     """Read a file. `changed`, the time of its last change in ns, is part of the cache's key."""
     with np.errstate(all="ignore"):  # damaged numbers overflow; they become gaps
-        file = parse_c3d(read_bytes(path, FILE_LIMITS.table_bytes), path)
+        file = parse_c3d(read_bytes(path, TABLE_BYTES), path)
         return _Reader(path, file, units).recording()
 
 
@@ -199,7 +192,7 @@ class _Reader:
         labels, equal = self._labels()
         scale = self._metres_per_unit()
         points, residual = self.file.points, self.file.residual
-        damaged = ~(np.abs(points) < C3D_VALUE.max_value).all(axis=2)
+        damaged = ~(np.abs(points) < MAX_VALUE).all(axis=2)
         points[damaged], residual[damaged] = np.nan, np.nan
         analog_rate, names, signals, units = self._analog(rate)
         plates = self._plates(names, signals, units, scale)
@@ -287,7 +280,7 @@ class _Reader:
         offset = np.concatenate([offset, np.zeros(count - len(offset))])
         factor = scale * (1.0 if general is None else general)
         signals = ((self.file.raw_analog - offset) * factor).T
-        signals[~(np.abs(signals) < C3D_VALUE.max_value)] = np.nan
+        signals[~(np.abs(signals) < MAX_VALUE)] = np.nan
         names = [name or f"channel {k}" for k, name in enumerate(names[:count], 1)]
         names += [f"channel {k}" for k in range(len(names) + 1, count + 1)]
         return rate * samples, names, signals, [*units[:count], *[""] * (count - len(units))]

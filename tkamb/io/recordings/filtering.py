@@ -25,7 +25,6 @@ References:
 """
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -41,21 +40,14 @@ if TYPE_CHECKING:
 Cutoff = float | Literal["none"]
 
 
-@dataclass(frozen=True)
-class SplineFilterSettings:
-    """The low-pass filter by splines."""
-
-    degree: int = 5
-    """Degree of the splines. Chosen because accelerations are then cubic and continuous."""
-    knots_per_period: int = 16
-    """Largest number of knots per period of the cut-off frequency. Chosen because the splines then
-    follow all frequencies that the filter passes."""
-    min_periods: float = 1.0
-    """Shortest motion, in periods of the cut-off frequency. Chosen because in a shorter motion all
-    samples are near an end."""
-
-
-SPLINE_FILTER = SplineFilterSettings()
+# Degree of the splines. Chosen because accelerations are then cubic and continuous.
+DEGREE = 5
+# Largest number of knots per period of the cut-off frequency. Chosen because the splines then
+# follow all frequencies that the filter passes.
+KNOTS_PER_PERIOD = 16
+# Shortest motion, in periods of the cut-off frequency. Chosen because in a shorter motion all
+# samples are near an end.
+MIN_PERIODS = 1.0
 
 
 def differentiate_coordinates(
@@ -159,11 +151,11 @@ def _check_samples(time: Array, values: Array, at: Array, name: str) -> None:
         raise InputError("a time or value is missing or not finite", name, "fill or cut the gap")
     if np.any(np.diff(time) <= 0):
         raise InputError("times do not rise strictly", name, "sort them and drop duplicates")
-    if len(time) < SPLINE_FILTER.degree + 1:
+    if len(time) < DEGREE + 1:
         raise InputError(
             f"{len(time)} samples are too few to differentiate twice",
             name,
-            f"record at least {SPLINE_FILTER.degree + 1}",
+            f"record at least {DEGREE + 1}",
         )
     slack = 1e-9 * (time[-1] - time[0])
     outside = at[(at < time[0] - slack) | (at > time[-1] + slack)]
@@ -214,7 +206,7 @@ def _check_cutoff(time: Array, cutoff_Hz: float, name: str) -> None:
             name,
             'lower cutoff_Hz of the scene, or set it to "none" to trust the samples',
         )
-    if duration * cutoff_Hz < SPLINE_FILTER.min_periods:
+    if duration * cutoff_Hz < MIN_PERIODS:
         raise InputError(
             f"{duration:g} s are shorter than one period of the cut-off {cutoff_Hz:g} Hz",
             name,
@@ -229,8 +221,8 @@ def _interpolating_spline(time: Array, values: Array, periodic: bool) -> "BSplin
     if periodic:
         values = values.copy()
         values[0] = values[-1] = 0.5 * (values[0] + values[-1])
-        return make_interp_spline(time, values, SPLINE_FILTER.degree, bc_type="periodic")
-    return make_interp_spline(time, values, SPLINE_FILTER.degree)
+        return make_interp_spline(time, values, DEGREE, bc_type="periodic")
+    return make_interp_spline(time, values, DEGREE)
 
 
 def _smoothing_spline(time: Array, values: Array, cutoff_Hz: float, periodic: bool) -> "BSpline":
@@ -240,26 +232,26 @@ def _smoothing_spline(time: Array, values: Array, cutoff_Hz: float, periodic: bo
 
     unit = 1.0 / (2.0 * math.pi * cutoff_Hz)  # in this unit of time lambda is one
     start, end = time[0] / unit, time[-1] / unit
-    pieces = math.ceil((end - start) * SPLINE_FILTER.knots_per_period / math.tau)
-    spans = max(SPLINE_FILTER.degree + 1, min(2 * len(time), pieces))
+    pieces = math.ceil((end - start) * KNOTS_PER_PERIOD / math.tau)
+    spans = max(DEGREE + 1, min(2 * len(time), pieces))
     step = (end - start) / spans
-    knots = start + step * np.arange(-SPLINE_FILTER.degree, spans + SPLINE_FILTER.degree + 1)
+    knots = start + step * np.arange(-DEGREE, spans + DEGREE + 1)
     inside = np.clip(
-        time / unit, knots[SPLINE_FILTER.degree], knots[-SPLINE_FILTER.degree - 1]
+        time / unit, knots[DEGREE], knots[-DEGREE - 1]
     )  # rounding may put an end outside
-    design = BSpline.design_matrix(inside, knots, SPLINE_FILTER.degree)
+    design = BSpline.design_matrix(inside, knots, DEGREE)
     weights = np.gradient(time / unit)
     if periodic:
         weights[[0, -1]] *= 0.5  # both are the sample at phase zero
-    wrap = sp.eye_array(spans + SPLINE_FILTER.degree, format="csr")
+    wrap = sp.eye_array(spans + DEGREE, format="csr")
     if periodic:
-        wrap = sp.vstack([wrap[:spans, :spans], wrap[: SPLINE_FILTER.degree, :spans]], format="csr")
+        wrap = sp.vstack([wrap[:spans, :spans], wrap[:DEGREE, :spans]], format="csr")
     penalty = wrap.T @ _third_derivative_gram(spans, step) @ wrap
     design = design @ wrap
     normal = design.T @ sp.diags_array(weights) @ design + penalty
     right = design.T @ (weights[:, None] * values.reshape(len(values), -1))
     coefficients = wrap @ splu(normal.tocsc()).solve(right)
-    return BSpline(knots * unit, coefficients.reshape(-1, *values.shape[1:]), SPLINE_FILTER.degree)
+    return BSpline(knots * unit, coefficients.reshape(-1, *values.shape[1:]), DEGREE)
 
 
 def _third_derivative_gram(spans: int, step: float) -> sp.csr_array:
@@ -275,7 +267,7 @@ def _third_derivative_gram(spans: int, step: float) -> sp.csr_array:
     nodes, weights = np.polynomial.legendre.leggauss(3)
     points = (np.arange(spans)[:, None] + 0.5 + 0.5 * nodes).ravel()
     quadratic = BSpline.design_matrix(points, knots, 2)
-    size = spans + SPLINE_FILTER.degree
+    size = spans + DEGREE
     third = sp.diags_array(
         [-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(size - 3, size), format="csr"
     )

@@ -42,22 +42,15 @@ _CALIBRATED = (4, 5)
 _log = logging.getLogger("tkamb")
 
 
-@dataclass(frozen=True)
-class PlateSettings:
-    """Checks of the baseline of a force plate."""
-
-    steady_N: float = 10.0
-    """N: largest standard deviation of the vertical force of an unloaded plate, over the frames of
-    ZERO. Chosen because a foot strike or toe-off gives more."""
-    baseline_N: float = 20.0
-    """N: largest mean vertical force, over the frames of ZERO, that counts as drift of the
-    amplifier. Chosen because a foot exerts more."""
-    baseline_share: float = 0.2
-    """1: as `baseline_N`, but a share of the largest change of the vertical force; the larger limit
-    holds. Chosen because a standing person exerts more."""
-
-
-SETTINGS = PlateSettings()
+# N: largest standard deviation of the vertical force of an unloaded plate, over the frames of
+# ZERO. Chosen because a foot strike or toe-off gives more.
+STEADY_N = 10.0
+# N: largest mean vertical force, over the frames of ZERO, that counts as drift of the amplifier.
+# Chosen because a foot exerts more.
+BASELINE_N = 20.0
+# 1: as `BASELINE_N`, but a share of the largest change of the vertical force; the larger limit
+# holds. Chosen because a standing person exerts more.
+BASELINE_SHARE = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,8 +229,8 @@ def _loaded_in_zero(record: PlateRecord, force: Array) -> str:
     window = vertical[record.zero]
     level, spread = float(window.mean()), float(window.std())
     change = np.nanmax(np.abs(vertical - level)) if np.isfinite(level) else 0.0
-    drift = abs(level) <= max(SETTINGS.baseline_N, SETTINGS.baseline_share * change)
-    if drift and spread <= SETTINGS.steady_N:
+    drift = abs(level) <= max(BASELINE_N, BASELINE_SHARE * change)
+    if drift and spread <= STEADY_N:
         return ""
     return (
         f"force plate {record.number} shows {abs(level):.0f} N in the frames that "
@@ -378,33 +371,25 @@ def _no_unit(record: PlateRecord, unit: str, key: str, example: str) -> InputErr
     )
 
 
-@dataclass(frozen=True)
-class PlateLoadSettings:
-    """When a force plate counts as loaded, and which force is drift."""
-
-    load_N: float = 20.0
-    """N: smallest load, above the unloaded level. Chosen because 20 N is usual for ground
-    reactions."""
-    margin_s: float = 0.05
-    """s: time before and after a load in which the wrench is used. Chosen because a foot strikes or
-    leaves within 0.02 s."""
-    quiet_share: float = 0.1
-    """1: this share of the samples, those with the smallest forces, is taken as unloaded. Their
-    median is the unloaded level. Chosen because a plate is usually unloaded for longer."""
-    quiet_spread_N: float = 2.0
-    """N: largest range of these samples. A larger range gives no unloaded level. Chosen because the
-    force of a foot varies more."""
-    most_drift_N: float = 60.0
-    """N: largest unloaded level that counts as drift. Chosen because a foot exerts more."""
-    drift_N: float = 2.0
-    """N: a larger unloaded level gets a note. Chosen because the median of noise is zero, and 2 N
-    change the force of the knee by less than 0.5 % of a body weight."""
-    unloaded_s: float = 0.1
-    """s: shortest unloaded time from which drift is computed. Chosen because a foot in swing leaves
-    the plate for longer."""
-
-
-PLATE_LOAD = PlateLoadSettings()
+# N: smallest load, above the unloaded level. Chosen because 20 N is usual for ground reactions.
+LOAD_N = 20.0
+# s: time before and after a load in which the wrench is used. Chosen because a foot strikes or
+# leaves within 0.02 s.
+MARGIN_S = 0.05
+# 1: this share of the samples, those with the smallest forces, is taken as unloaded. Their median
+# is the unloaded level. Chosen because a plate is usually unloaded for longer.
+QUIET_SHARE = 0.1
+# N: largest range of these samples. A larger range gives no unloaded level. Chosen because the
+# force of a foot varies more.
+QUIET_SPREAD_N = 2.0
+# N: largest unloaded level that counts as drift. Chosen because a foot exerts more.
+MOST_DRIFT_N = 60.0
+# N: a larger unloaded level gets a note. Chosen because the median of noise is zero, and 2 N
+# change the force of the knee by less than 0.5 % of a body weight.
+DRIFT_N = 2.0
+# s: shortest unloaded time from which drift is computed. Chosen because a foot in swing leaves the
+# plate for longer.
+UNLOADED_S = 0.1
 
 
 def around_load(force: Array, time: Array) -> np.ndarray:
@@ -415,15 +400,9 @@ def around_load(force: Array, time: Array) -> np.ndarray:
         time: (k,) s.
     """
     forces = np.sort(force[np.isfinite(force)])
-    smallest = forces[: math.ceil(PLATE_LOAD.quiet_share * len(forces))]
-    steady = (
-        len(smallest)
-        and np.ptp(smallest) <= PLATE_LOAD.quiet_spread_N
-        and smallest[-1] <= PLATE_LOAD.most_drift_N
-    )
-    loaded = np.flatnonzero(
-        force >= PLATE_LOAD.load_N + (float(np.median(smallest)) if steady else 0.0)
-    )
+    smallest = forces[: math.ceil(QUIET_SHARE * len(forces))]
+    steady = len(smallest) and np.ptp(smallest) <= QUIET_SPREAD_N and smallest[-1] <= MOST_DRIFT_N
+    loaded = np.flatnonzero(force >= LOAD_N + (float(np.median(smallest)) if steady else 0.0))
     if not len(loaded):
         return np.zeros(len(force), bool)
     after = np.searchsorted(loaded, np.arange(len(force)))
@@ -431,7 +410,7 @@ def around_load(force: Array, time: Array) -> np.ndarray:
         np.abs(time[loaded[np.minimum(after, len(loaded) - 1)]] - time),
         np.abs(time - time[loaded[np.maximum(after - 1, 0)]]),
     )
-    return np.asarray(nearest <= PLATE_LOAD.margin_s)
+    return np.asarray(nearest <= MARGIN_S)
 
 
 def unloaded_level(vertical: Array, on: np.ndarray, time: Array) -> float:
@@ -446,4 +425,4 @@ def unloaded_level(vertical: Array, on: np.ndarray, time: Array) -> float:
     """
     unloaded = vertical[~on & np.isfinite(vertical)]
     step = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
-    return float(np.median(unloaded)) if len(unloaded) * step >= PLATE_LOAD.unloaded_s else 0.0
+    return float(np.median(unloaded)) if len(unloaded) * step >= UNLOADED_S else 0.0

@@ -13,20 +13,12 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, Mask
 
-
-@dataclass(frozen=True)
-class GaitSettings:
-    """When a foot counts as on the ground."""
-
-    contact_force_N: float = 20.0
-    """N: smallest vertical force of a foot on the ground; Zeni et al., Gait & Posture 27:710
-    (2008). It is above a plate's noise, and reached within some milliseconds of the strike."""
-    shortest_phase_s: float = 0.1
-    """s: shortest stance or swing; a shorter one is noise. Chosen because stance and swing of
-    walking last 0.6 and 0.4 s."""
-
-
-GAIT = GaitSettings()
+# N: smallest vertical force of a foot on the ground; Zeni et al., Gait & Posture 27:710 (2008). It
+# is above a plate's noise, and reached within some milliseconds of the strike.
+CONTACT_FORCE_N = 20.0
+# s: shortest stance or swing; a shorter one is noise. Chosen because stance and swing of walking
+# last 0.6 and 0.4 s.
+SHORTEST_PHASE_S = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,11 +72,11 @@ def find_gait(time: Array, vertical: Array) -> Gait:
         time: (k,) s, rising.
         vertical: (k,) N, upward ground reaction of the foot, unfiltered.
     """
-    on = vertical >= GAIT.contact_force_N
+    on = vertical >= CONTACT_FORCE_N
     for state in (False, True):  # first short gaps in a stance, then short contacts
         for first, last in uninterrupted_runs(on == state):
             inside = first > 0 and last < len(on) - 1
-            if inside and time[last] - time[first] < GAIT.shortest_phase_s:
+            if inside and time[last] - time[first] < SHORTEST_PHASE_S:
                 on[first : last + 1] = not state
     stances = [
         (
@@ -114,7 +106,7 @@ def uninterrupted_runs(chosen: Mask) -> list[tuple[int, int]]:
 def _crossing(time: Array, vertical: Array, after: int) -> float:
     """Return the time (s) at which the force crosses the threshold before sample `after`."""
     low, high = vertical[after - 1], vertical[after]
-    share = (GAIT.contact_force_N - low) / (high - low) if high != low else 1.0
+    share = (CONTACT_FORCE_N - low) / (high - low) if high != low else 1.0
     share = float(np.clip(share, 0.0, 1.0))
     return float(time[after - 1] + share * (time[after] - time[after - 1]))
 

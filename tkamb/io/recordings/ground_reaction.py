@@ -21,7 +21,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, Array
 from tkamb.io.recordings.c3d import read_c3d
 from tkamb.io.recordings.filtering import Cutoff, differentiate_coordinates
-from tkamb.io.recordings.force_plates import PLATE_LOAD, around_load, unloaded_level
+from tkamb.io.recordings.force_plates import DRIFT_N, around_load, unloaded_level
 from tkamb.io.recordings.gait_cycle import Gait, find_gait
 from tkamb.io.recordings.laboratory import check_roles, laboratory_rotation
 from tkamb.io.recordings.recording_tables import GroundReactionTable, Side
@@ -34,24 +34,18 @@ DIRECTIONS = ("forward", "upward", "rightward")
 """Names of the laboratory's axes in messages. A file may have other axes."""
 
 
-@dataclass(frozen=True)
-class GroundReactionSettings:
-    """How a measured ground reaction is read and checked."""
+# m: largest change of height of the centre of pressure on a level plate, and largest height
+# between plates. Chosen because rounding is smaller.
+LEVEL_TOLERANCE = 0.01
+# s: time before and after the frames in which samples are searched for odd values. Chosen because
+# the filter's response is several times shorter.
+WINDOW = 0.5
+# N·m: a larger horizontal moment is about a point other than the centre of pressure.
+MOMENT_TOLERANCE = 1e-6
+# m: largest horizontal distance of the centre of pressure from the ankle. Chosen because it is
+# more than the length of a foot; a farther point is under another foot.
+MAX_ANKLE_DISTANCE = 0.5
 
-    level_tolerance: float = 0.01
-    """m: largest change of height of the centre of pressure on a level plate, and largest height
-    between plates. Chosen because rounding is smaller."""
-    window: float = 0.5
-    """s: time before and after the frames in which samples are searched for odd values. Chosen
-    because the filter's response is several times shorter."""
-    moment_tolerance: float = 1e-6
-    """N·m: a larger horizontal moment is about a point other than the centre of pressure."""
-    max_ankle_distance: float = 0.5
-    """m: largest horizontal distance of the centre of pressure from the ankle. Chosen because it is
-    more than the length of a foot; a farther point is under another foot."""
-
-
-GROUND_REACTION = GroundReactionSettings()
 
 LARGEST = {"force": (20000.0, "N"), "moment": (1000.0, "N·m")}
 """Largest accepted values. Force: twice the force on a triple jumper's foot. Moment: many times any
@@ -141,14 +135,12 @@ def load_ground_reaction(source: GroundReactionTable, time: Array, side: Side) -
     _check_upward(force, source)
     loaded = force[:, 1] >= source.unloaded_N
     interpolated, point = _reference_points(recorded, loaded, path)
-    near = (stamps >= time[0] - GROUND_REACTION.window) & (
-        stamps <= time[-1] + GROUND_REACTION.window
-    )
+    near = (stamps >= time[0] - WINDOW) & (stamps <= time[-1] + WINDOW)
     # Plates record the wrench. Their centre of pressure is a quotient and noisy at small forces.
     points = None if from_plates else point[near]
     odd = _odd_samples(path, stamps[near], force[near], points, loaded[near], source.cutoff_Hz)
     level = float(np.median(point[loaded, 1])) if loaded.any() else 0.0
-    if loaded.any() and np.abs(point[loaded, 1] - level).max() > GROUND_REACTION.level_tolerance:
+    if loaded.any() and np.abs(point[loaded, 1] - level).max() > LEVEL_TOLERANCE:
         raise InputError(
             "the centre of pressure leaves the plate's level while it is loaded",
             path,
@@ -200,7 +192,7 @@ def _reference_points(
     except in rows with a horizontal moment: its reference point is the recorded point.
     """
     interpolated = _interpolate_unloaded(recorded.time, recorded.point, loaded, path)
-    horizontal = np.abs(recorded.moment[:, [0, 2]]) > GROUND_REACTION.moment_tolerance
+    horizontal = np.abs(recorded.moment[:, [0, 2]]) > MOMENT_TOLERANCE
     about_recorded: NDArray[np.bool_] = np.asarray(
         np.isfinite(recorded.point).all(axis=1) & horizontal.any(axis=1)
     )
@@ -323,7 +315,7 @@ def check_under_foot(ground: GroundReaction, ankle: Array, path: Path) -> None:
     """
     horizontal = (ground.point - ankle)[ground.loaded][:, [0, 2]]
     farthest = float(np.linalg.norm(horizontal, axis=1).max(initial=0.0))
-    if farthest > GROUND_REACTION.max_ankle_distance:
+    if farthest > MAX_ANKLE_DISTANCE:
         raise InputError(
             f"the centre of pressure lies up to {farthest:.3g} m from the ankle",
             path,
@@ -393,7 +385,7 @@ def _read_plates(source: GroundReactionTable) -> RecordedReaction:
     plates = [recording.plate(number) for number in dict.fromkeys(source.plates)]
     rotation = laboratory_rotation(source.laboratory_axes, source.file)
     levels = [float((rotation @ plate.centre)[1]) for plate in plates]
-    if np.ptp(levels) > GROUND_REACTION.level_tolerance:
+    if np.ptp(levels) > LEVEL_TOLERANCE:
         raise InputError(
             "the plates lie at different levels",
             source.file,
@@ -407,7 +399,7 @@ def _read_plates(source: GroundReactionTable) -> RecordedReaction:
         on = around_load(size, recording.analog_time)
         wrenches.append(np.where((on | ~np.isfinite(wrench).all(axis=1))[:, None], wrench, 0.0))
         level = unloaded_level(wrench[:, 1], on, recording.analog_time)
-        if abs(level) > PLATE_LOAD.drift_N:
+        if abs(level) > DRIFT_N:
             drift[plate.number] = level
     point, moment, force = summed_reaction(
         recording.analog_time,

@@ -23,23 +23,15 @@ from scipy.spatial.transform import Rotation
 
 from tkamb.geometry.frames import Array, knee_pose, pose, transform
 
-
-@dataclass(frozen=True)
-class InverseKinematicsSettings:
-    """The fit of the poses of a leg to its markers, frame by frame."""
-
-    step_tolerance: float = 1e-6
-    """m and rad: a frame has converged when its step is smaller. Chosen because it is far below the
-    noise of markers."""
-    newton_below: float = 0.1
-    """m and rad: after a smaller step, the next step includes the curvature of the residuals
-    (Newton); otherwise it does not (Gauss-Newton). Chosen because Newton's method converges near
-    the solution only."""
-    max_iterations: int = 60
-    """Largest number of iterations of a frame. Chosen because frames that converge need fewer."""
-
-
-INVERSE_KINEMATICS = InverseKinematicsSettings()
+# m and rad: a frame has converged when its step is smaller. Chosen because it is far below the
+# noise of markers.
+STEP_TOLERANCE = 1e-6
+# m and rad: after a smaller step, the next step includes the curvature of the residuals (Newton);
+# otherwise it does not (Gauss-Newton). Chosen because Newton's method converges near the solution
+# only.
+NEWTON_BELOW = 0.1
+# Largest number of iterations of a frame. Chosen because frames that converge need fewer.
+MAX_ITERATIONS = 60
 
 
 State = TypeVar("State")
@@ -108,7 +100,7 @@ class ChainFit(Generic[State]):
         state: the fitted state.
         rms: (f,) m, root mean square of `distance`; NaN without markers.
         distance: (f, m) m, from each measured marker to the chain's; NaN for a missing marker.
-        solved: (f,) whether the last step was below `INVERSE_KINEMATICS.step_tolerance`.
+        solved: (f,) whether the last step was below `STEP_TOLERANCE`.
         steps: number of iterations.
     """
 
@@ -135,15 +127,15 @@ def fit_chain(
     damping, last_size = np.full(len(measured), 1e-6), np.full(len(measured), np.inf)
     active, steps = np.arange(len(measured)), 0
     state, residual = start, chain.normal(start, target, frame_weights)
-    while steps < INVERSE_KINEMATICS.max_iterations:
+    while steps < MAX_ITERATIONS:
         step = _step(
             residual.of(active),
             damping[active],
-            last_size[active] < INVERSE_KINEMATICS.newton_below,
+            last_size[active] < NEWTON_BELOW,
         )
         trial = chain.moved(chain.chosen(state, active), step)
         size = np.abs(step).max(axis=1)
-        converged = size < INVERSE_KINEMATICS.step_tolerance
+        converged = size < STEP_TOLERANCE
         state = chain.replaced(
             state, active[converged], chain.chosen(trial, np.flatnonzero(converged))
         )

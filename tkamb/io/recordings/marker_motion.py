@@ -33,7 +33,7 @@ from tkamb.io.recordings.inverse_kinematics import (
     fit_chain,
 )
 from tkamb.io.recordings.laboratory import laboratory_rotation
-from tkamb.io.recordings.markers import MARKER_FIT, fit_seen, marker_trajectories
+from tkamb.io.recordings.markers import MAX_MEDIAN_RESIDUAL, fit_seen, marker_trajectories
 from tkamb.io.recordings.recording_tables import MarkersTable, MotionTable, Side
 from tkamb.io.recordings.samples import check_spacing
 from tkamb.io.recordings.tables import Table, read_table
@@ -44,16 +44,9 @@ Method = Literal["segments", "chain"]
 KNEE_SEGMENTS = ("shank", "thigh")
 
 
-@dataclass(frozen=True)
-class MarkerMotionSettings:
-    """The motion of a leg from markers."""
-
-    max_joint_gap: float = 0.1
-    """m: largest distance between two positions of one joint, each by the markers of one segment.
-    Chosen because skin at the hip moves by a third of this, and the other foot is farther away."""
-
-
-MARKER_MOTION = MarkerMotionSettings()
+# m: largest distance between two positions of one joint, each by the markers of one segment.
+# Chosen because skin at the hip moves by a third of this, and the other foot is farther away.
+MAX_JOINT_GAP = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,7 +202,7 @@ def _check_fits(rms: dict[str, Array], recorded: Table) -> None:
                 recorded.path,
                 "check the labels in [motion.markers], or use another trial",
             )
-        if len(finite) and np.median(finite) > MARKER_FIT.max_median_residual:
+        if len(finite) and np.median(finite) > MAX_MEDIAN_RESIDUAL:
             raise InputError(
                 f"markers of the {name} have a residual of {np.median(finite) / MILLIMETRE:.0f} mm",
                 recorded.path,
@@ -225,7 +218,7 @@ def _check_joints(segments: list[Segment], poses: dict[str, Array], recorded: Ta
             continue
         ends = transform(poses[neighbour], segment.joint) - transform(poses[name], segment.centre)
         distance = np.linalg.norm(ends, axis=1)
-        if np.isfinite(distance).any() and np.nanmedian(distance) > MARKER_MOTION.max_joint_gap:
+        if np.isfinite(distance).any() and np.nanmedian(distance) > MAX_JOINT_GAP:
             raise InputError(
                 f"markers of the {name} and of the {neighbour} give positions of their joint that "
                 f"are {np.nanmedian(distance) / MILLIMETRE:.0f} mm apart",

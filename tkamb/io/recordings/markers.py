@@ -4,7 +4,6 @@
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,17 +14,9 @@ from tkamb.io.recordings.recording_tables import TibiaTable
 from tkamb.io.recordings.tables import Table
 from tkamb.units import MILLIMETRE
 
-
-@dataclass(frozen=True)
-class MarkerFitSettings:
-    """Check of the rigid fit of a body to its markers."""
-
-    max_median_residual: float = 0.05
-    """m: largest median residual. Chosen because soft tissue causes less; a larger residual is due
-    to a wrong marker or unit."""
-
-
-MARKER_FIT = MarkerFitSettings()
+# m: largest median residual. Chosen because soft tissue causes less; a larger residual is due to a
+# wrong marker or unit.
+MAX_MEDIAN_RESIDUAL = 0.05
 
 
 def plain_label(label: str) -> str:
@@ -96,7 +87,7 @@ def shank_points(source: TibiaTable, recorded: Table) -> tuple[Array, Array]:
 def check_fit(residual: Array, what: str, recorded: Table) -> None:
     """Raise an InputError if the median of the residuals (n,), m, is too large."""
     finite = residual[np.isfinite(residual)]
-    if len(finite) and np.median(finite) > MARKER_FIT.max_median_residual:
+    if len(finite) and np.median(finite) > MAX_MEDIAN_RESIDUAL:
         raise InputError(
             f"{what} have a residual of {np.median(finite) / MILLIMETRE:.0f} mm",
             recorded.path,

@@ -29,15 +29,8 @@ FORCE = {"N": 1.0, "kN": 1e3, "lbf": 4.4482216152605}
 """Newtons per unit of force; lbf: 0.45359237 kg x 9.80665 m/s²."""
 
 
-@dataclass(frozen=True)
-class ForceSampleSettings:
-    """Interpolation between the samples of a measured force."""
-
-    max_gap: float = 2.5
-    """1: widest gap to interpolate, in median time steps. Chosen because one sample may be lost."""
-
-
-FORCE_SAMPLES = ForceSampleSettings()
+# 1: widest gap to interpolate, in median time steps. Chosen because one sample may be lost.
+MAX_GAP = 2.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +58,7 @@ class MeasuredForce:
         step = np.diff(self.time)
         right = np.clip(np.searchsorted(self.time, time), 1, len(self.time) - 1)
         inside = (time >= self.time[0]) & (time <= self.time[-1])
-        inside &= step[right - 1] <= FORCE_SAMPLES.max_gap * np.median(step)
+        inside &= step[right - 1] <= MAX_GAP * np.median(step)
         return {
             name: np.where(inside, np.interp(time, self.time, values), np.nan)
             for name, values in self.force.items()
@@ -112,22 +105,15 @@ def _with_third(force: dict[str, Array]) -> dict[str, Array]:
     return force
 
 
-@dataclass(frozen=True)
-class EmgSettings:
-    """Computation of the envelopes of EMG."""
-
-    filter_order: int = 2
-    """Order of each Butterworth filter in one direction. Chosen because forwards and backwards
-    together give the usual fourth order."""
-    flat_share: float = 1e-9
-    """1: smallest peak of an envelope, as a share of the signal's largest value. Chosen because a
-    smaller peak is round-off."""
-    step_tolerance: float = 0.01
-    """1: largest deviation of a time step from the median step, as a share of it. Chosen because
-    the jitter of a clock is smaller."""
-
-
-EMG = EmgSettings()
+# Order of each Butterworth filter in one direction. Chosen because forwards and backwards together
+# give the usual fourth order.
+FILTER_ORDER = 2
+# 1: smallest peak of an envelope, as a share of the signal's largest value. Chosen because a
+# smaller peak is round-off.
+FLAT_SHARE = 1e-9
+# 1: largest deviation of a time step from the median step, as a share of it. Chosen because the
+# jitter of a clock is smaller.
+STEP_TOLERANCE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +156,7 @@ def load_envelopes(source: EmgTable, motion: Array) -> Envelopes:
     """
     time, signals, remarks = _signals(source)
     step = np.diff(time)
-    if len(step) < 2 or np.abs(step - np.median(step)).max() > EMG.step_tolerance * np.median(step):
+    if len(step) < 2 or np.abs(step - np.median(step)).max() > STEP_TOLERANCE * np.median(step):
         raise InputError("has EMG that is not sampled evenly", source.file, "resample it")
     check_overlap(source.file, time + source.offset_s, motion, "[muscles.emg]")
     rate = len(step) / (time[-1] - time[0])
@@ -186,7 +172,7 @@ def load_envelopes(source: EmgTable, motion: Array) -> Envelopes:
             result.max() if source.normalised_by == "recording" else source.normalised_by[channel]
         )
         normalised_by[channel] = float(divisor)
-        if not result.max() > EMG.flat_share * np.abs(signal).max():
+        if not result.max() > FLAT_SHARE * np.abs(signal).max():
             raise InputError(f"channel '{channel}' holds no signal", source.file, "leave it out")
         values[channel] = result / normalised_by[channel]
     muscles = {muscle: channel for channel, names in source.channels.items() for muscle in names}
@@ -234,7 +220,7 @@ def _low_passed(signal: Array, cutoff: float) -> Array:
     """
     mirrored = np.concatenate([signal, signal[-2:0:-1]])
     ratio = np.tan(np.pi * np.fft.rfftfreq(len(mirrored))) / np.tan(np.pi * cutoff)
-    spectrum = np.fft.rfft(mirrored) / (1.0 + ratio ** (2 * EMG.filter_order))
+    spectrum = np.fft.rfft(mirrored) / (1.0 + ratio ** (2 * FILTER_ORDER))
     return np.fft.irfft(spectrum, len(mirrored))[: len(signal)]
 
 

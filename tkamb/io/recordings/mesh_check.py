@@ -14,29 +14,21 @@ from tkamb.geometry.surface import Surface
 from tkamb.geometry.topology import BoundaryLoop, boundary_loops, separate_bodies
 from tkamb.io.recordings.meshes import (
     BONE_SIZE,
-    MESH_FILE,
+    SHEET_OPENING,
     Indices,
     plausible_units,
     read_triangles,
 )
 from tkamb.units import LENGTH
 
-
-@dataclass(frozen=True)
-class MeshUnitSettings:
-    """Guesses of a mesh's unit and bottom, and the length of the report."""
-
-    typical_size: float = 0.08
-    """m: assumed length of a mesh whose unit cannot be guessed. Chosen because a knee component has
-    this length."""
-    min_size_share: float = 0.12
-    """1: smallest area of a flat side in the report, as a share of the mesh's area. Chosen because
-    the bottom of an insert is larger."""
-    max_listed: int = 10
-    """Largest number of bodies in the report. Chosen because a report should be short."""
-
-
-MESH_UNIT = MeshUnitSettings()
+# m: assumed length of a mesh whose unit cannot be guessed. Chosen because a knee component has
+# this length.
+TYPICAL_SIZE = 0.08
+# 1: smallest area of a flat side in the report, as a share of the mesh's area. Chosen because the
+# bottom of an insert is larger.
+MIN_SIZE_SHARE = 0.12
+# Largest number of bodies in the report. Chosen because a report should be short.
+MAX_LISTED = 10
 
 
 @dataclass(frozen=True)
@@ -138,13 +130,10 @@ class MeshHealth:
     def _parts(self) -> list[str]:
         if len(self.bodies) < 2:
             return []
-        unlisted = len(self.bodies) - MESH_UNIT.max_listed
+        unlisted = len(self.bodies) - MAX_LISTED
         return [
             f"  {len(self.bodies)} separate bodies; `tkamb mesh part FILE N --out F` writes one:",
-            *(
-                f"    {n}: {b.line()}"
-                for n, b in enumerate(self.bodies[: MESH_UNIT.max_listed], start=1)
-            ),
+            *(f"    {n}: {b.line()}" for n, b in enumerate(self.bodies[:MAX_LISTED], start=1)),
             *([f"    and {unlisted} smaller"] if unlisted > 0 else []),
         ]
 
@@ -162,7 +151,7 @@ class MeshHealth:
         for hole in self.remaining_holes[:5]:
             where = ", ".join(f"{value:.4g}" for value in hole.centre)
             lines.append(f"  open: {hole.edges} edges, {hole.width:.3g} wide, at ({where})")
-        if self.remaining_holes and self.remaining_holes[0].width > MESH_FILE.sheet_opening * max(
+        if self.remaining_holes and self.remaining_holes[0].width > SHEET_OPENING * max(
             self.extents
         ):
             lines.append(
@@ -258,7 +247,7 @@ def _measure(vertices: Array, faces: Indices) -> tuple[Array, list[str], float]:
     extents = np.ptp(vertices[faces.reshape(-1)], axis=0)
     longest = float(extents.max())
     units = plausible_units(longest) or plausible_units(longest, BONE_SIZE)
-    return extents, units, LENGTH[units[0]] if units else MESH_UNIT.typical_size / (longest or 1.0)
+    return extents, units, LENGTH[units[0]] if units else TYPICAL_SIZE / (longest or 1.0)
 
 
 def _bodies(mended: Repair, scale: float) -> tuple[Part, ...]:
@@ -292,9 +281,7 @@ def _flats(mended: Repair, name: str) -> tuple[FlatSide, ...]:
     for flat in find_flats(surface):
         tilt = np.degrees(np.arccos(min(np.abs(flat.normal).max(), 1.0)))
         sides.append(FlatSide(facing(flat.normal), flat.area / total, float(tilt)))
-    return tuple(
-        side for side in sides if side.area_share > MESH_UNIT.min_size_share and side.tilt_deg < 30
-    )
+    return tuple(side for side in sides if side.area_share > MIN_SIZE_SHARE and side.tilt_deg < 30)
 
 
 def _count_noun(count: int, noun: str) -> str:

@@ -2,14 +2,14 @@
 
 import logging
 import re
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.errors import InputError
-from tkamb.files import FILE_LIMITS, check_file
+from tkamb.files import MESH_BYTES, check_file
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.frames import Array
 from tkamb.geometry.polygons import triangulated
@@ -28,29 +28,23 @@ BONE_SIZE = (0.010, 0.650)
 """m; accepted lengths of a bone at the knee, whole or in part."""
 
 
-@dataclass(frozen=True)
-class MeshFileSettings:
-    """Which meshes of components are used."""
+# m: smallest component with two condyles. Chosen because real ones are at least 50 mm wide.
+MIN_SIZE = 0.034
+# m: coarser rounding of coordinates gets a notice. Chosen because forces then change by about 0.5
+# %.
+ROUNDING_NOTICE = 1e-6
+# m: a mesh with coarser rounding of coordinates is refused. Chosen because 8 µm change forces by 4
+# %.
+ROUNDING_LIMIT = 5e-6
+# Number of bytes in which a file's space is searched. Chosen because headers are shorter.
+HEADER_BYTES = 4096
+# 1: area of the wall between touching bodies, in the plan view, from which one body lies on the
+# other, as a share of the part's extents. Chosen: a post covers less, a tray more.
+STACKED_SHARE = 0.3
+# 1: widest hole of a part, as a share of its length. A part with a wider hole is an open sheet.
+# Chosen because holes of damaged files are smaller.
+SHEET_OPENING = 1.0 / 3.0
 
-    min_size: float = 0.034
-    """m: smallest component with two condyles. Chosen because real ones are at least 50 mm wide."""
-    rounding_notice: float = 1e-6
-    """m: coarser rounding of coordinates gets a notice. Chosen because forces then change by about
-    0.5 %."""
-    rounding_limit: float = 5e-6
-    """m: a mesh with coarser rounding of coordinates is refused. Chosen because 8 µm change forces
-    by 4 %."""
-    header_bytes: int = 4096
-    """Number of bytes in which a file's space is searched. Chosen because headers are shorter."""
-    stacked_share: float = 0.3
-    """1: area of the wall between touching bodies, in the plan view, from which one body lies on
-    the other, as a share of the part's extents. Chosen: a post covers less, a tray more."""
-    sheet_opening: float = 1.0 / 3.0
-    """1: widest hole of a part, as a share of its length. A part with a wider hole is an open
-    sheet. Chosen because holes of damaged files are smaller."""
-
-
-MESH_FILE = MeshFileSettings()
 
 USUAL_SIZE = (0.040, 0.120)
 """m; lengths of usual components, including partial knees."""
@@ -168,7 +162,7 @@ def space_of(path: str | Path) -> str | None:
     """
     try:
         with open(path, "rb") as file:
-            head = file.read(MESH_FILE.header_bytes)
+            head = file.read(HEADER_BYTES)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", path) from error
     if Path(path).suffix.lower() == ".stl":
@@ -227,7 +221,7 @@ def read_triangles(path: str | Path) -> tuple[Array, Indices]:
 def _read_mesh(path: Path) -> tuple[Array, Indices]:
     """Return vertices and triangles of a mesh file. Polygons are cut into triangles."""
     try:
-        check_file(path, FILE_LIMITS.mesh_bytes, what="mesh file")
+        check_file(path, MESH_BYTES, what="mesh file")
         suffix = path.suffix.lower()
         if suffix == ".stl" and (corners := read_binary_stl(path)) is not None:
             return corners, np.arange(len(corners)).reshape(-1, 3)
@@ -265,7 +259,7 @@ def plausible_units(extent: float, size: tuple[float, float] = IMPLANT_SIZE) -> 
     if size != IMPLANT_SIZE:
         return fits
     usual = [unit for unit in fits if USUAL_SIZE[0] <= lengths[unit] <= USUAL_SIZE[1]]
-    return [unit for unit in fits if lengths[unit] >= MESH_FILE.min_size or not usual]
+    return [unit for unit in fits if lengths[unit] >= MIN_SIZE or not usual]
 
 
 def body_size(body: Body, unit: float) -> str:
@@ -311,7 +305,7 @@ def _check_stacked(
     surface = Surface(mended.vertices, mended.faces, name, merged=True)
     level = 0.5 * float(surface.areas[wall.faces] @ np.abs(surface.face_normals[wall.faces] @ up))
     across = np.ptp(mended.vertices, axis=0)[np.abs(up) < 0.5]
-    if level < MESH_FILE.stacked_share * float(across.prod()):
+    if level < STACKED_SHARE * float(across.prod()):
         return
     where = ", ".join(f"{round(value / LENGTH[unit], 2) + 0.0:g}" for value in wall.centre)
     raise InputError(
@@ -344,7 +338,7 @@ def _check_part(
     Bodies that touch or overlap at an inner wall count as one.
     """
     extent = float(np.ptp(mended.vertices, axis=0).max())
-    if mended.holes and mended.holes[0].width > MESH_FILE.sheet_opening * extent:
+    if mended.holes and mended.holes[0].width > SHEET_OPENING * extent:
         raise InputError(
             f"{name} is an open sheet, like a contact surface: its opening is "
             f"{mended.holes[0].width / MILLIMETRE:.3g} mm wide, so that its inside cannot be "
@@ -410,7 +404,7 @@ def _check_size(
 def _check_knee_width(surface: Surface, path: str | Path) -> None:
     """Raise an InputError if a component with two condyles is smaller than any person's knee."""
     extents = np.ptp(surface.bounds, axis=0)
-    if extents.max() < MESH_FILE.min_size and condyle_split(surface) is not None:
+    if extents.max() < MIN_SIZE and condyle_split(surface) is not None:
         raise InputError(
             f"{surface.name} has two condyles and is {extents[2] / MILLIMETRE:.3g} mm wide, "
             "smaller than any person's knee",
@@ -422,14 +416,14 @@ def _check_knee_width(surface: Surface, path: str | Path) -> None:
 def _check_rounding(corners: Array, unit: str, path: str | Path, name: str) -> None:
     """Warn, or raise an InputError, if coordinates (n, 3) are rounded too coarsely."""
     rounding = coordinate_rounding(corners) * LENGTH[unit]
-    if rounding <= MESH_FILE.rounding_notice:
+    if rounding <= ROUNDING_NOTICE:
         return
     far = float(np.abs(corners).max()) * LENGTH[unit] / MILLIMETRE
     words = (
         f"{name} lies {far:.3g} mm from the origin of its file, where coordinates are rounded to "
         f"{rounding / MILLIMETRE:.2g} mm"
     )
-    if rounding > MESH_FILE.rounding_limit:
+    if rounding > ROUNDING_LIMIT:
         raise InputError(
             words, path, "move the part to the origin in the CAD program, and export it again"
         )

@@ -48,16 +48,10 @@ FARTHEST_MM = (-200, 200)
 hand's breadth of the insert, and the patella within a hand's breadth of the femoral origin."""
 
 
-@dataclass(frozen=True)
-class PatellaMotionSettings:
-    """Which recorded poses of the patella are plausible."""
+# deg: largest rotation of the patella against the femur, in either direction. Chosen because no
+# patella turns by half a turn.
+MAX_ROTATION_DEG = 180
 
-    max_rotation_deg: int = 180
-    """deg: largest rotation of the patella against the femur, in either direction. Chosen because
-    no patella turns by half a turn."""
-
-
-PATELLA_MOTION = PatellaMotionSettings()
 
 FASTEST = {"turn": 100.0, "move": 10.0}
 """rad/s and m/s: largest speeds, five times those of the fastest kick and above the noise of a
@@ -286,7 +280,7 @@ def _check_knee(knee: Array, path: Path, bending: str | None = None) -> None:
 
 def _check_patella(patella: Array, path: Path) -> None:
     """Raise an InputError if the patella's coordinates (n, 3) are impossible."""
-    turn = (-PATELLA_MOTION.max_rotation_deg, PATELLA_MOTION.max_rotation_deg)
+    turn = (-MAX_ROTATION_DEG, MAX_ROTATION_DEG)
     for name, values, limits, unit, key in (
         ("patella_ap", patella[:, 0] / MILLIMETRE, FARTHEST_MM, "mm", "length_unit"),
         ("patella_si", patella[:, 1] / MILLIMETRE, FARTHEST_MM, "mm", "length_unit"),

@@ -110,21 +110,14 @@ def combined(first: RigidInertia, second: RigidInertia) -> RigidInertia:
     return RigidInertia(mass, centre, tensor)
 
 
-@dataclass(frozen=True)
-class PatellaLinkSettings:
-    """The patella's inertia if the URDF states none, and a check of the axes of the links."""
-
-    mass: float = 0.1
-    """kg: mass of the patella, at its link's origin, if the URDF states none (assumed)."""
-    radius_of_gyration: float = 0.015
-    """m: radius of gyration of this mass about any axis. Chosen because it is about that of a disc
-    of 40 mm diameter and 20 mm thickness."""
-    max_lateral_share: float = 0.5
-    """1: largest distance of a link's far end from the link's y axis (up), as a share of the link's
-    length. Chosen because a link with a larger distance does not lie along its y axis."""
-
-
-PATELLA_LINK = PatellaLinkSettings()
+# kg: mass of the patella, at its link's origin, if the URDF states none (assumed).
+MASS = 0.1
+# m: radius of gyration of this mass about any axis. Chosen because it is about that of a disc of
+# 40 mm diameter and 20 mm thickness.
+RADIUS_OF_GYRATION = 0.015
+# 1: largest distance of a link's far end from the link's y axis (up), as a share of the link's
+# length. Chosen because a link with a larger distance does not lie along its y axis.
+MAX_LATERAL_SHARE = 0.5
 
 
 THIGH = (0.2, 0.7)
@@ -222,7 +215,7 @@ def _check_places(robot: ElementTree.Element, path: Path) -> None:
         if (
             not low <= distance <= high
             or position[1] < 0
-            or np.hypot(*position[[0, 2]]) > PATELLA_LINK.max_lateral_share * distance
+            or np.hypot(*position[[0, 2]]) > MAX_LATERAL_SHARE * distance
         ):
             words = ", ".join(f"{value:.4g}" for value in position)
             raise InputError(
@@ -255,8 +248,8 @@ def _complete_inertias(
         assert patient.sex is not None
         _write_inertia(links[name], _segment(robot, name, patient.sex, patient))
     if with_patella and links["patella"].find("inertial") is None:
-        tensor = PATELLA_LINK.mass * PATELLA_LINK.radius_of_gyration**2 * np.eye(3)
-        _write_inertia(links["patella"], RigidInertia(PATELLA_LINK.mass, np.zeros(3), tensor))
+        tensor = MASS * RADIUS_OF_GYRATION**2 * np.eye(3)
+        _write_inertia(links["patella"], RigidInertia(MASS, np.zeros(3), tensor))
 
 
 def _segment(

@@ -12,27 +12,20 @@ import numpy as np
 from tkamb.geometry.frames import Array
 from tkamb.units import LENGTH
 
+# N: vertical force above which the centre of pressure is checked. Chosen because a smaller force
+# makes it a quotient of small numbers.
+LOADED_N = 100.0
+# 1: share of the plate's half width by which the median centre of pressure may lie outside the
+# corners. Chosen because a loaded plate has smaller errors.
+BESIDE = 0.2
+# 1: if 95 % of the centres of pressure are closer to the transducers' origin than this share of
+# both half widths, below a millimetre, the moments are too small. A foot's centre of pressure
+# moves by centimetres.
+RESTING = 0.003
+# 1: another unit is accepted only if the farthest centre of pressure (95 %) is farther from the
+# transducers' origin than this share of a half width.
+MOVING = 0.05
 
-@dataclass(frozen=True)
-class PressureSettings:
-    """When a centre of pressure is plausible."""
-
-    loaded_N: float = 100.0
-    """N: vertical force above which the centre of pressure is checked. Chosen because a smaller
-    force makes it a quotient of small numbers."""
-    beside: float = 0.2
-    """1: share of the plate's half width by which the median centre of pressure may lie outside the
-    corners. Chosen because a loaded plate has smaller errors."""
-    resting: float = 0.003
-    """1: if 95 % of the centres of pressure are closer to the transducers' origin than this share
-    of both half widths, below a millimetre, the moments are too small. A foot's centre of pressure
-    moves by centimetres."""
-    moving: float = 0.05
-    """1: another unit is accepted only if the farthest centre of pressure (95 %) is farther from
-    the transducers' origin than this share of a half width."""
-
-
-PRESSURE = PressureSettings()
 
 USUAL, UNUSUAL = ("mm", "m"), ("cm", "inch")
 """Units of length in moments, which are tried in this order if the stated one is impossible."""
@@ -53,17 +46,17 @@ class PressureRange:
     @property
     def beside(self) -> bool:
         """Whether most centres of pressure lie beside the surface."""
-        return bool((self.median > 1.0 + PRESSURE.beside).any())
+        return bool((self.median > 1.0 + BESIDE).any())
 
     @property
     def resting(self) -> bool:
         """Whether the centre of pressure rests at the transducers' origin."""
-        return bool((self.origin < PRESSURE.resting).all())
+        return bool((self.origin < RESTING).all())
 
     @property
     def usual(self) -> bool:
         """Whether the centres of pressure are those of a foot on the plate."""
-        return not self.beside and bool((self.origin > PRESSURE.moving).any())
+        return not self.beside and bool((self.origin > MOVING).any())
 
 
 def pressure_range(
@@ -77,7 +70,7 @@ def pressure_range(
         moment: (k, 3) N·m about the surface's centre, in the plate's axes.
         origin: (3,) m, vector from the transducers' origin to the surface's centre.
     """
-    loaded = (np.abs(force[:, 2]) > PRESSURE.loaded_N) & np.isfinite(moment).all(axis=1)
+    loaded = (np.abs(force[:, 2]) > LOADED_N) & np.isfinite(moment).all(axis=1)
     if not loaded.any():
         return None
     half = 0.5 * np.linalg.norm([corners[0] - corners[1], corners[0] - corners[3]], axis=1)

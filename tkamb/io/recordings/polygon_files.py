@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.errors import InputError
-from tkamb.files import FILE_LIMITS, read_bytes
+from tkamb.files import MESH_BYTES, read_bytes
 from tkamb.geometry.frames import Array, Index
 
 Polygons = tuple[Array, Index, Index]
@@ -40,7 +40,7 @@ def read_obj(path: str | Path) -> Polygons:
         InputError: no such file.
         ValueError: an invalid line, which the message quotes.
     """
-    text = read_bytes(path, FILE_LIMITS.mesh_bytes, what="mesh file").decode("latin-1")
+    text = read_bytes(path, MESH_BYTES, what="mesh file").decode("latin-1")
     if "\\" in text:  # a backslash continues a line
         text = text.replace("\\\r\n", " ").replace("\\\n", " ")
     vertices: list[tuple[float, ...]] = []
@@ -86,7 +86,7 @@ def read_ply(path: str | Path) -> Polygons:
         InputError: no such file.
         ValueError: the file is no PLY file, is cut short or holds triangle strips.
     """
-    content = read_bytes(path, FILE_LIMITS.mesh_bytes, what="mesh file")
+    content = read_bytes(path, MESH_BYTES, what="mesh file")
     order, elements, start = _ply_header(content)
     if any(element.name == "tristrips" for element in elements):
         raise ValueError("it holds triangle strips")

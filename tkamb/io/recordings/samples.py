@@ -14,25 +14,17 @@ from numpy.typing import NDArray
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 
-
-@dataclass(frozen=True)
-class SampleSettings:
-    """How odd samples are recognised."""
-
-    neighbours: int = 12
-    """Number of samples on either side for the median deviation. Chosen because they are enough for
-    a median, and few enough to follow a movement."""
-    outlier_factor: float = 8.0
-    """1: smallest ratio of an odd sample's deviation to the median. Chosen because normal noise
-    exceeds it once in 10 million samples."""
-    max_step: float = 5.0
-    """s: largest median step between samples. Chosen because slower samples record no movement."""
-    end_factor: float = 4.0
-    """1: factor on `outlier_factor` at the ends of a recording. Chosen because extrapolation of a
-    cubic has larger errors than interpolation."""
-
-
-SAMPLE = SampleSettings()
+# Number of samples on either side for the median deviation. Chosen because they are enough for a
+# median, and few enough to follow a movement.
+NEIGHBOURS = 12
+# 1: smallest ratio of an odd sample's deviation to the median. Chosen because normal noise exceeds
+# it once in 10 million samples.
+OUTLIER_FACTOR = 8.0
+# s: largest median step between samples. Chosen because slower samples record no movement.
+MAX_STEP = 5.0
+# 1: factor on `OUTLIER_FACTOR` at the ends of a recording. Chosen because extrapolation of a cubic
+# has larger errors than interpolation.
+END_FACTOR = 4.0
 
 
 @dataclass(frozen=True)
@@ -72,8 +64,8 @@ def odd_samples(
         return ()
     away = np.abs(values - neighbours_curve(time, values))
     ends = np.ones(len(time))
-    ends[[0, 1, -2, -1]] = SAMPLE.end_factor
-    limit = np.maximum(floor, SAMPLE.outlier_factor * _running_median(away / ends)) * ends
+    ends[[0, 1, -2, -1]] = END_FACTOR
+    limit = np.maximum(floor, OUTLIER_FACTOR * _running_median(away / ends)) * ends
     # An odd sample also shifts the curves of its four neighbours, by 2/3 and 1/6 of its deviation.
     odd = [k for k in np.flatnonzero(away > limit) if away[k] >= away[max(k - 2, 0) : k + 3].max()]
     return tuple(OddSample(path, what, float(time[k]), float(away[k] / scale), unit) for k in odd)
@@ -96,7 +88,7 @@ def neighbours_curve(time: Array, values: Array) -> Array:
 
 def _running_median(away: Array) -> Array:
     """Return the running median (n,) of the deviations."""
-    width = min(2 * SAMPLE.neighbours + 1, len(away))
+    width = min(2 * NEIGHBOURS + 1, len(away))
     windows = np.lib.stride_tricks.sliding_window_view(away, width)
     start = np.clip(np.arange(len(away)) - width // 2, 0, len(windows) - 1)
     return np.asarray(np.median(windows, axis=1)[start])
@@ -108,7 +100,7 @@ def check_spacing(path: Path, time: Array) -> None:
         what = f"has one row, at {time[0]:g} s, which is no movement"
         raise InputError(what, path, "give a recording of several rows")
     spacing = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-    if spacing > SAMPLE.max_step:
+    if spacing > MAX_STEP:
         raise InputError(
             f"samples are {spacing:g} s apart, too far to be a movement",
             path,

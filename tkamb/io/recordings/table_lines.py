@@ -8,7 +8,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from tkamb.files import BYTE_ORDER_MARKS, FILE_LIMITS, read_bytes
+from tkamb.files import BYTE_ORDER_MARKS, TABLE_BYTES, read_bytes
 
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
 """Separator of cells -> its name in notices."""
@@ -23,7 +23,7 @@ def read_lines(path: Path) -> list[str]:
     Raises:
         InputError: no such file, or larger than a table may be.
     """
-    content = read_bytes(path, FILE_LIMITS.table_bytes)
+    content = read_bytes(path, TABLE_BYTES)
     encodings = [name for mark, name in BYTE_ORDER_MARKS.items() if content.startswith(mark)]
     try:
         text = content.decode((encodings or ["utf-8"])[0])

@@ -16,18 +16,11 @@ from tkamb.io.recordings.table_lines import SEPARATORS, read_lines, tab_separate
 from tkamb.io.recordings.unit_words import GivenUnits, metres
 from tkamb.units import LENGTH
 
+# s: largest rounding of the times of a `.trc`. Chosen because cameras write milliseconds.
+TRC_TIME_ROUNDING = 1e-3
+# Largest number in any unit. A larger number is refused as no measurement.
+MAX_VALUE = 1e12
 
-@dataclass(frozen=True)
-class TableValueSettings:
-    """Which numbers of a table are measurements."""
-
-    trc_time_rounding: float = 1e-3
-    """s: largest rounding of the times of a `.trc`. Chosen because cameras write milliseconds."""
-    max_value: float = 1e12
-    """Largest number in any unit. A larger number is refused as no measurement."""
-
-
-TABLE_VALUE = TableValueSettings()
 
 TRC_LABELS = 3
 """Index of the line of a `.trc` with the markers' labels."""
@@ -398,7 +391,7 @@ def _exact_time(time: Array, frame: Array, rate: str) -> Array:
         return time
     even = (frame - frame[0]) * period
     even = even + (time - even).mean()
-    return even if np.abs(even - time).max() <= TABLE_VALUE.trc_time_rounding else time
+    return even if np.abs(even - time).max() <= TRC_TIME_ROUNDING else time
 
 
 def _columns(
@@ -427,7 +420,7 @@ def _row(cells: list[str], path: Path, line: int) -> list[float]:
         # Converting the whole row at once is faster. A cell that fails gets its message below.
         with contextlib.suppress(ValueError):
             numbers = [float(cell) for cell in cells]
-            if max(numbers) <= TABLE_VALUE.max_value and min(numbers) >= -TABLE_VALUE.max_value:
+            if max(numbers) <= MAX_VALUE and min(numbers) >= -MAX_VALUE:
                 return numbers
     return [_number(cell, path, line) for cell in cells]
 
@@ -444,7 +437,7 @@ def _number(cell: str, path: Path, line: int) -> float:
     if math.isinf(number):
         hint = "leave the cell empty where nothing was measured"
         raise InputError(f"line {line} holds '{text}', which is not finite", path, hint)
-    if abs(number) > TABLE_VALUE.max_value:
+    if abs(number) > MAX_VALUE:
         raise InputError(
             f"line {line} holds '{text}', which is no measurement", path, "correct the cell"
         )

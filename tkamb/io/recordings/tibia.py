@@ -29,26 +29,19 @@ from tkamb.io.recordings.samples import (
 from tkamb.io.recordings.tables import Table, read_table
 from tkamb.units import DEGREE, MILLIMETRE
 
+# deg: largest lean of a shank from the vertical, in either direction. Chosen because a sprinter's
+# shank swings back by 110 deg.
+MAX_LEAN_DEG = 150.0
+# m: largest distance from the laboratory's origin. Chosen because it is beyond the view of any
+# camera.
+MAX_DISTANCE = 100.0
+# m: distance from the ankle to the proximal point that is checked. Chosen because it is about the
+# length of an adult's shank.
+SHANK_LENGTH = 0.4
+# s: time before and after the frames in which samples are checked. Chosen because the filter's
+# response is several times shorter.
+WINDOW = 0.5
 
-@dataclass(frozen=True)
-class TibiaPoseSettings:
-    """Which recorded poses of the tibia are plausible."""
-
-    max_lean_deg: float = 150.0
-    """deg: largest lean of a shank from the vertical, in either direction. Chosen because a
-    sprinter's shank swings back by 110 deg."""
-    max_distance: float = 100.0
-    """m: largest distance from the laboratory's origin. Chosen because it is beyond the view of any
-    camera."""
-    shank_length: float = 0.4
-    """m: distance from the ankle to the proximal point that is checked. Chosen because it is about
-    the length of an adult's shank."""
-    window: float = 0.5
-    """s: time before and after the frames in which samples are checked. Chosen because the filter's
-    response is several times shorter."""
-
-
-TIBIA_POSE = TibiaPoseSettings()
 
 FASTEST_TURN, FASTEST_MOVE = 100.0, 30.0
 """rad/s and m/s: largest speeds, twice those of the shank of the fastest sprinters and kickers."""
@@ -125,10 +118,10 @@ def _odd_poses(recorded: Table, stamps: Array, poses: Array, time: Array) -> tup
     Raises:
         InputError: an impossible position or speed.
     """
-    near = (stamps >= time[0] - TIBIA_POSE.window) & (stamps <= time[-1] + TIBIA_POSE.window)
+    near = (stamps >= time[0] - WINDOW) & (stamps <= time[-1] + WINDOW)
     ends = {
         "ankle": np.zeros(3),
-        "proximal end of the shank": np.array([0.0, TIBIA_POSE.shank_length, 0.0]),
+        "proximal end of the shank": np.array([0.0, SHANK_LENGTH, 0.0]),
     }
     odd: list[OddSample] = []
     for end, point in ends.items():
@@ -136,7 +129,7 @@ def _odd_poses(recorded: Table, stamps: Array, poses: Array, time: Array) -> tup
         for axis, values in zip("xyz", places.T, strict=True):
             what = f"{axis} of the {end}"
             limits, hint = (
-                (-TIBIA_POSE.max_distance, TIBIA_POSE.max_distance),
+                (-MAX_DISTANCE, MAX_DISTANCE),
                 "check [tibia] columns and length_unit",
             )
             check_range(recorded.path, f"shank: {what}", values, limits, "m", hint)
@@ -154,7 +147,7 @@ def _sagittal(
     stamps = recorded.time(source.columns.get("time", "time"))
     lean = recorded.complete_column(source.columns.get("angle", "angle"))
     lean = lean * angle_scale(recorded, source.angle_unit)
-    limits = (-TIBIA_POSE.max_lean_deg, TIBIA_POSE.max_lean_deg)
+    limits = (-MAX_LEAN_DEG, MAX_LEAN_DEG)
     hint = "check [tibia] columns and angle_unit: the angle is the lean from the vertical"
     check_range(recorded.path, "shank: angle", lean / DEGREE, limits, "deg", hint)
     check_spacing(recorded.path, stamps)

@@ -6,7 +6,6 @@ then becomes zero, and a joint without limits gets another type. These checks ra
 
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -68,16 +67,9 @@ _AXIS_ROUNDING = 1e-6
 programs write six digits. The nominal axis replaces it."""
 
 
-@dataclass(frozen=True)
-class UrdfAngleSettings:
-    """Check that the angles of a URDF are in radians."""
-
-    max_angle: float = 8.0 * np.pi
-    """rad: a larger angle is assumed to be in degrees. Chosen because angles in a URDF are below
-    one turn."""
-
-
-URDF_ANGLE = UrdfAngleSettings()
+# rad: a larger angle is assumed to be in degrees. Chosen because angles in a URDF are below one
+# turn.
+MAX_ANGLE = 8.0 * np.pi
 
 
 def check_elements(robot: ElementTree.Element, path: Path) -> None:
@@ -127,7 +119,7 @@ def _check_attributes(element: ElementTree.Element, where: str) -> None:
         if key in ("value", *_INERTIA) and abs(float(text)) > _HEAVIEST:
             hint = f"give at most {_HEAVIEST:g} (kg, kg·m²)"
             raise InputError(f'<{element.tag} {key}="{text}"> is too large for a body', where, hint)
-        if key == "rpy" and np.abs(numbers_of(element, key)).max() > URDF_ANGLE.max_angle:
+        if key == "rpy" and np.abs(numbers_of(element, key)).max() > MAX_ANGLE:
             hint = "give rpy in radians, not in degrees"
             raise InputError(f'<origin rpy="{text}"> is a rotation by several turns', where, hint)
 

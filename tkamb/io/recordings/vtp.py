@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tkamb.errors import InputError
-from tkamb.files import FILE_LIMITS, parse_xml, read_bytes
+from tkamb.files import MESH_BYTES, parse_xml, read_bytes
 from tkamb.geometry.frames import Array
 from tkamb.geometry.polygons import triangulated
 
@@ -60,7 +60,7 @@ def read_vtp_values(path: str | Path, name: str) -> Array:
 
 
 def _read(path: str | Path, select: "Callable[[_PolyData], Read]") -> Read:
-    content = read_bytes(path, FILE_LIMITS.mesh_bytes, what="mesh file")
+    content = read_bytes(path, MESH_BYTES, what="mesh file")
     try:
         return select(_PolyData(content, path))
     except (ValueError, KeyError, OverflowError, zlib.error) as error:

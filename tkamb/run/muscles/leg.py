@@ -17,7 +17,6 @@ coefficients of the authors' code, for which f_l(1) = f_v(0) = 1.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -37,20 +36,13 @@ BELLS = (
 VELOCITY = (-0.3211346127989808, -8.149, -0.374, 0.8825327733249912)
 
 
-@dataclass(frozen=True)
-class HillSettings:
-    """Force-length and force-velocity curves of a Hill-type muscle."""
-
-    passive_shape: float = 4.0
-    """1: exponent of the passive curve. Thelen (2003) has 4 for adults under 65."""
-    passive_strain: float = 0.6
-    """1: strain beyond the optimal length at which the passive force is F_max."""
-    longest_fibre_ratio: float = 1.8
-    """1: largest fibre length over the optimal length for which the curves are valid. Chosen
-    because the passive force at 1.6 is F_max already."""
-
-
-HILL = HillSettings()
+# 1: exponent of the passive curve. Thelen (2003) has 4 for adults under 65.
+PASSIVE_SHAPE = 4.0
+# 1: strain beyond the optimal length at which the passive force is F_max.
+PASSIVE_STRAIN = 0.6
+# 1: largest fibre length over the optimal length for which the curves are valid. Chosen because
+# the passive force at 1.6 is F_max already.
+LONGEST_FIBRE_RATIO = 1.8
 
 
 def active_force_length(length: Array) -> Array:
@@ -73,8 +65,8 @@ def force_velocity(velocity: Array) -> Array:
 
 def passive_force_length(length: Array) -> Array:
     """Return f_p at lengths l/l_o."""
-    growth = HILL.passive_shape * np.maximum(length - 1.0, 0.0) / HILL.passive_strain
-    return np.expm1(growth) / np.expm1(HILL.passive_shape)
+    growth = PASSIVE_SHAPE * np.maximum(length - 1.0, 0.0) / PASSIVE_STRAIN
+    return np.expm1(growth) / np.expm1(PASSIVE_SHAPE)
 
 
 def rigid_tendon_strength(
@@ -88,7 +80,7 @@ def rigid_tendon_strength(
         speeds: rates of the path lengths, m/s, (..., m).
 
     Returns:
-        The forces, NaN for fibres longer than `HILL.longest_fibre_ratio`.
+        The forces, NaN for fibres longer than `LONGEST_FIBRE_RATIO`.
     """
     optimal = np.array([muscle.optimal_fibre_length_m for muscle in muscles])
     slack = np.array([muscle.tendon_slack_length_m for muscle in muscles])
@@ -98,7 +90,7 @@ def rigid_tendon_strength(
     along = lengths_m - slack
     fibre = np.hypot(width, along)
     cosine = np.where(along > 0.0, along / np.maximum(fibre, 1e-300), 0.0)
-    length = np.where(fibre > HILL.longest_fibre_ratio * optimal, np.nan, fibre / optimal)
+    length = np.where(fibre > LONGEST_FIBRE_RATIO * optimal, np.nan, fibre / optimal)
     active = active_force_length(length) * force_velocity(cosine * speeds / fastest)
     return strength * cosine * active, strength * cosine * passive_force_length(length)
 
@@ -116,16 +108,9 @@ GROUPS = {
 """Regions of a muscle's ends -> name of its group."""
 
 
-@dataclass(frozen=True)
-class ModelMatchSettings:
-    """Limits below which two muscles of a model are the same muscle."""
-
-    tolerance: float = 1e-6
-    """1 or m: largest relative difference of strength and lengths, and largest distance of points.
-    Chosen because the rounding of files is smaller."""
-
-
-MODEL_MATCH = ModelMatchSettings()
+# 1 or m: largest relative difference of strength and lengths, and largest distance of points.
+# Chosen because the rounding of files is smaller.
+TOLERANCE = 1e-6
 
 
 def leg_bones(leg: Leg) -> dict[str, tuple[str, ...]]:
@@ -156,27 +141,19 @@ def leg_coordinates(leg: Leg) -> tuple[str, ...]:
     return (*free(leg.hip), leg.flexion, *free(leg.ankle), *(c for j in below for c in free(j)))
 
 
-@dataclass(frozen=True)
-class ReserveSettings:
-    """Reserve moments of a leg in a scene with [muscles]."""
-
-    at_hip: float = 1e4
-    """N·m: size of the reserve of the hip's coordinates, so large that it costs nothing. Chosen
-    because the abductors of scaled models are too weak for the moments of inverse dynamics. With
-    10 N·m the muscles that cross hip and knee supply them, and the knee's load is too large
-    (docs/truth.md)."""
-    elsewhere: float = 10.0
-    """N·m: size at knee, ankle and subtalar joint, as usual in static optimisation."""
-
-
-RESERVE = ReserveSettings()
+# N·m: size of the reserve of the hip's coordinates, so large that it costs nothing. Chosen because
+# the abductors of scaled models are too weak for the moments of inverse dynamics. With 10 N·m the
+# muscles that cross hip and knee supply them, and the knee's load is too large (docs/truth.md).
+AT_HIP = 1e4
+# N·m: size at knee, ankle and subtalar joint, as usual in static optimisation.
+ELSEWHERE = 10.0
 
 
 def default_reserves(leg: Leg) -> dict[str, float]:
     """Return coordinate -> size of its reserve, N·m, for the balanced coordinates of a leg."""
     coordinates = leg.model.coordinates
     return {
-        name: RESERVE.at_hip if coordinates[name].joint == leg.hip.name else RESERVE.elsewhere
+        name: AT_HIP if coordinates[name].joint == leg.hip.name else ELSEWHERE
         for name in leg_coordinates(leg)
     }
 
@@ -278,9 +255,9 @@ def _same_muscle(one: OpenSimMuscle, other: OpenSimMuscle) -> bool:
     )
     first, second = one.path.points[0], other.path.points[0]
     return (
-        bool((np.abs(values - other_values) <= MODEL_MATCH.tolerance * values).all())
+        bool((np.abs(values - other_values) <= TOLERANCE * values).all())
         and isinstance(first, PathPoint)
         and isinstance(second, PathPoint)
         and first.body == second.body
-        and float(np.abs(first.location - second.location).max()) < MODEL_MATCH.tolerance
+        and float(np.abs(first.location - second.location).max()) < TOLERANCE
     )

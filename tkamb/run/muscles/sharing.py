@@ -30,7 +30,7 @@ import numpy as np
 from tkamb.errors import ComputationError, InputError, not_installed
 from tkamb.geometry.frames import Array
 from tkamb.io.opensim.model import OpenSimMuscle
-from tkamb.run.muscles.leg import HILL
+from tkamb.run.muscles.leg import LONGEST_FIBRE_RATIO
 
 
 @dataclass(frozen=True)
@@ -294,16 +294,9 @@ class EmgGuide:
         )
 
 
-@dataclass(frozen=True)
-class SharingSettings:
-    """Acceptance of a solution of the static optimisation."""
-
-    kkt_tolerance: float = 1e-8
-    """1: largest relative violation of the optimality conditions. Beyond it the frame fails. Chosen
-    because the solver's residuals are smaller."""
-
-
-SHARING = SharingSettings()
+# 1: largest relative violation of the optimality conditions. Beyond it the frame fails. Chosen
+# because the solver's residuals are smaller.
+KKT_TOLERANCE = 1e-8
 
 
 @dataclass(frozen=True)
@@ -394,7 +387,7 @@ class FrameProblems:
             except ComputationError as error:
                 reason = error.what
             else:
-                if shared.kkt_residual < SHARING.kkt_tolerance:
+                if shared.kkt_residual < KKT_TOLERANCE:
                     others = shared.others[: len(self.coordinates)]
                     return shared.activation, others, shared.kkt_residual, "ok"
                 reason = f"the conditions of the optimum are violated by {shared.kkt_residual:.1g}"
@@ -409,7 +402,7 @@ class FrameProblems:
             (~np.isfinite(self.arms[k]).all(axis=1), "no taut path of"),
             (
                 ~np.isfinite(self.active[k]),
-                f"fibres beyond {HILL.longest_fibre_ratio:g} optimal lengths in",
+                f"fibres beyond {LONGEST_FIBRE_RATIO:g} optimal lengths in",
             ),
         ):
             if missing.any():

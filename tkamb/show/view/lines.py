@@ -4,7 +4,6 @@ The magnitude of a force comes from results.csv, its line of action from the geo
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,15 +38,8 @@ if TYPE_CHECKING:
 NOTHING = np.full(3, np.nan)
 
 
-@dataclass(frozen=True)
-class ArrowSettings:
-    """Arrows of the viewer."""
-
-    contact_point_radius: float = 0.6 * MILLIMETRE
-    """m: radius of the sphere at a centre of pressure. Chosen by eye."""
-
-
-ARROW = ArrowSettings()
+# m: radius of the sphere at a centre of pressure. Chosen by eye.
+CONTACT_POINT_RADIUS = 0.6 * MILLIMETRE
 
 
 def force_arrows(
@@ -98,7 +90,7 @@ def contact_markers(geometries: Sequence[KneeGeometry]) -> tuple[Marker, ...]:
             "patella" if name == patella else "contact points",
             BLACK,
             np.stack(points),
-            ARROW.contact_point_radius,
+            CONTACT_POINT_RADIUS,
         )
         for name, points in result.items()
         if np.isfinite(points).any()
@@ -209,24 +201,16 @@ BUNDLE, TENDON_RADIUS, PATH = 1.0 * MILLIMETRE, 1.5 * MILLIMETRE, 0.35 * MILLIME
 halved if there are more than `many_bundles` bundles."""
 
 
-@dataclass(frozen=True)
-class ViewStrandSettings:
-    """Style of muscles and ligaments in the viewer."""
-
-    muscle_radius: float = 2.0 * MILLIMETRE
-    """m: radius of a muscle's tube. Chosen by eye."""
-    slack_force: float = 1.0
-    """N: a tendon or muscle with a smaller force is grey. Chosen because this force is
-    negligible."""
-    least_activation: float = 0.1
-    """1: smallest upper end of the colour scale of activations. Chosen because small activations
-    then look small."""
-    many_bundles: int = 20
-    """Number of ligament bundles above which their radius is halved. Chosen because thick bundles
-    would cover each other."""
-
-
-VIEW_STRAND = ViewStrandSettings()
+# m: radius of a muscle's tube. Chosen by eye.
+MUSCLE_RADIUS = 2.0 * MILLIMETRE
+# N: a tendon or muscle with a smaller force is grey. Chosen because this force is negligible.
+SLACK_FORCE = 1.0
+# 1: smallest upper end of the colour scale of activations. Chosen because small activations then
+# look small.
+LEAST_ACTIVATION = 0.1
+# Number of ligament bundles above which their radius is halved. Chosen because thick bundles would
+# cover each other.
+MANY_BUNDLES = 20
 
 
 def ligament_strands(
@@ -244,7 +228,7 @@ def ligament_strands(
     failures = failed(results)
     strains = [np.where(failures, np.nan, one.strain(one.length(poses))) for one in bundles]
     limit = float(np.max(strains, initial=0.01, where=np.isfinite(strains)))
-    radius = BUNDLE * (0.5 if len(bundles) > VIEW_STRAND.many_bundles else 1.0)
+    radius = BUNDLE * (0.5 if len(bundles) > MANY_BUNDLES else 1.0)
     strands = []
     for bundle, strain in zip(bundles, strains, strict=True):
         points = np.stack(bundle.ends(poses), axis=1)
@@ -271,9 +255,7 @@ def extensor_strands(
             paths.append((None, None))
     muscle, ligament = (list(result) for result in zip(*paths, strict=True))
     name = extensor.lines.muscle.name.replace("_", " ")
-    slack = [
-        results[f"{one}_N"] < VIEW_STRAND.slack_force for one in ("quadriceps", "patellar_ligament")
-    ]
+    slack = [results[f"{one}_N"] < SLACK_FORCE for one in ("quadriceps", "patellar_ligament")]
     return (
         _tendon(name, muscle, slack[0]),
         _tendon("patellar ligament", ligament, slack[1]),
@@ -299,15 +281,15 @@ def muscle_strands(geometries: Sequence[KneeGeometry]) -> tuple[tuple[Strand, ..
             ends[k, :, 1] = transform(one.state.pose("femur"), share.lines.thigh)
             activation[k], force[k] = share.activation[share.crossing], share.force[share.crossing]
     finite = np.isfinite(activation)
-    limit = float(np.max(activation, initial=VIEW_STRAND.least_activation, where=finite))
-    colours = activation_colours(np.where(force < VIEW_STRAND.slack_force, 0.0, activation), limit)
+    limit = float(np.max(activation, initial=LEAST_ACTIVATION, where=finite))
+    colours = activation_colours(np.where(force < SLACK_FORCE, 0.0, activation), limit)
     strands = tuple(
         Strand(
             first.muscles[muscle],
             "muscles",
             ends[:, i],
             np.repeat(colours[:, i, None], 2, axis=1),
-            VIEW_STRAND.muscle_radius,
+            MUSCLE_RADIUS,
         )
         for i, muscle in enumerate(first.crossing)
     )

@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,15 +27,9 @@ SIZE = (1280, 720)
 """Width and height of pictures, pixels. MP4 needs even numbers."""
 
 
-@dataclass(frozen=True)
-class FilmSettings:
-    """Settings of a film of the viewer."""
+# Largest number of frames per second. Chosen because browsers play no GIF faster.
+MAX_FRAME_RATE = 50.0
 
-    max_frame_rate: float = 50.0
-    """Largest number of frames per second. Chosen because browsers play no GIF faster."""
-
-
-FILM = FilmSettings()
 
 READY = (
     "new Promise((done, fail) => { setTimeout(() => fail('not drawn in 60 s'), 60000); "
@@ -82,7 +75,7 @@ def write_film(show: "Show", path: Path, progress: Progress = lambda frames: fra
     """
     times = max((one.times for one in show.drawings), key=len)
     rate = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 1.0
-    rate = float(np.clip(rate, 1.0, FILM.max_frame_rate))
+    rate = float(np.clip(rate, 1.0, MAX_FRAME_RATE))
     pictures = film_frames(show.html(), len(times), progress)
     write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
     with replaced_file(path) as temporary:
@@ -173,15 +166,8 @@ BROWSERS = (
 SOFTWARE_GRAPHICS = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 
-@dataclass(frozen=True)
-class PageSettings:
-    """Pictures of the viewer page by a browser."""
-
-    timeout: float = 120.0
-    """s: time limit of the browser. Chosen because a page usually takes some seconds."""
-
-
-PAGE = PageSettings()
+# s: time limit of the browser. Chosen because a page usually takes some seconds.
+TIMEOUT = 120.0
 
 
 def page_html(
@@ -271,9 +257,9 @@ def screenshot(html: str, size: tuple[int, int]) -> bytes:
             f"{page.as_uri()}#figure=1",
         ]
         try:
-            process = subprocess.run(command, capture_output=True, timeout=PAGE.timeout)
+            process = subprocess.run(command, capture_output=True, timeout=TIMEOUT)
         except subprocess.TimeoutExpired:
-            raise ComputationError(f"no picture of the page in {PAGE.timeout:g} s") from None
+            raise ComputationError(f"no picture of the page in {TIMEOUT:g} s") from None
         if b'data-ready="yes"' not in process.stdout or not picture.exists():
             raise ComputationError("the page could not be drawn", str(browser))
         return picture.read_bytes()

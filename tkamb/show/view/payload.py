@@ -44,17 +44,10 @@ from tkamb.show.view.drawing import (
 )
 from tkamb.units import MILLIMETRE
 
+# Largest number of triangles of a drawn surface. A finer surface is decimated. Chosen because a
+# frame of two such surfaces takes less than 100 ms without a graphics card.
+MAX_TRIANGLES = 6_000
 
-@dataclass(frozen=True)
-class ShadingSettings:
-    """Simplification of the surfaces in the viewer."""
-
-    max_triangles: int = 6_000
-    """Largest number of triangles of a drawn surface. A finer surface is decimated. Chosen because
-    a frame of two such surfaces takes less than 100 ms without a graphics card."""
-
-
-SHADING = ShadingSettings()
 
 AGGRESSIVENESS = range(5, 11)
 """Values of the simplifier's aggressiveness, tried in turn until few enough triangles remain."""
@@ -78,7 +71,7 @@ class Shaded:
 
 
 @lru_cache(maxsize=16)
-def shade(surface: Surface, most_triangles: int = SHADING.max_triangles) -> Shaded:
+def shade(surface: Surface, most_triangles: int = MAX_TRIANGLES) -> Shaded:
     """Return a surface for drawing. A vertex on a sharp edge occurs once per normal."""
     surface, error = decimate(surface, most_triangles)
     normals = surface.corner_normals
@@ -122,21 +115,14 @@ def _distance(one: Surface, other: Surface) -> float:
     )
 
 
-@dataclass(frozen=True)
-class ViewPayloadSettings:
-    """Numbers that scale the drawings of the viewer's page."""
-
-    arrow_metres_per_body_weight: float = 0.03
-    """m per body weight: length of a force arrow. Chosen because arrows fit beside the knee."""
-    pressure_levels: int = 32767
-    """Number of levels between zero and the largest pressure. Chosen because the levels are then
-    invisible, and a level fits in 16 bits."""
-    most_coloured_triangles: int = 100_000
-    """Largest number of triangles of a surface that shows wear. Chosen because merged triangles
-    blur the colours of wear."""
-
-
-VIEW_PAYLOAD = ViewPayloadSettings()
+# m per body weight: length of a force arrow. Chosen because arrows fit beside the knee.
+ARROW_METRES_PER_BODY_WEIGHT = 0.03
+# Number of levels between zero and the largest pressure. Chosen because the levels are then
+# invisible, and a level fits in 16 bits.
+PRESSURE_LEVELS = 32767
+# Largest number of triangles of a surface that shows wear. Chosen because merged triangles blur
+# the colours of wear.
+MOST_COLOURED_TRIANGLES = 100_000
 
 
 WHITE = "#ffffff"
@@ -190,7 +176,7 @@ def pack(drawings: Sequence[Drawing]) -> bytes:
         {
             "layers": list(LAYERS),
             "hidden": list(HIDDEN_AT_FIRST),
-            "metres_per_body_weight": VIEW_PAYLOAD.arrow_metres_per_body_weight,
+            "metres_per_body_weight": ARROW_METRES_PER_BODY_WEIGHT,
             "peak_MPa": peak,
             "strain_limit": limit,
             "activation_limit": max(one.activation_limit for one in drawings),
@@ -230,7 +216,7 @@ def _view(
     for solid in drawing.solids:
         shape = shade(
             solid.surface,
-            SHADING.max_triangles if solid.wear is None else VIEW_PAYLOAD.most_coloured_triangles,
+            MAX_TRIANGLES if solid.wear is None else MOST_COLOURED_TRIANGLES,
         )
         if shape.error:
             notes.append(
@@ -312,7 +298,7 @@ def map_levels(pressure_map: PressureMap, peak: float) -> NDArray[np.int16]:
         peak: upper end of the colour scale, MPa. A higher pressure has the highest level.
     """
     level = pressure_levels(pressure_map.pressure, pressure_map.gap, pressure_map.triangles, peak)
-    whole = np.maximum(np.round(np.abs(level) * VIEW_PAYLOAD.pressure_levels), 1.0)
+    whole = np.maximum(np.round(np.abs(level) * PRESSURE_LEVELS), 1.0)
     return np.where(level > 0, whole, -whole).astype(np.int16)
 
 

@@ -10,7 +10,6 @@ import json
 import secrets
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Lock
@@ -32,24 +31,18 @@ from tkamb.units import MEGAPASCAL, MILLIMETRE
 HOST = "127.0.0.1"
 
 
-@dataclass(frozen=True)
-class ViewServerSettings:
-    """Limits of the viewer's local server."""
+# Largest number of bytes of a request; a longer request is refused. Chosen because the page's
+# requests are far shorter.
+MOST_REQUEST_BYTES = 10_000
+# s: a connection is closed if its client sends no byte for this time. Chosen because a browser
+# sends its request at once.
+IDLE_SECONDS = 15.0
+# Largest number of characters of a text answer; the rest is cut off. Chosen because a page can
+# show this many.
+LONGEST_LINE = 2000
+# Number of random bytes of the token in the address. Chosen because nobody can guess it.
+TOKEN_BYTES = 18
 
-    most_request_bytes: int = 10_000
-    """Largest number of bytes of a request; a longer request is refused. Chosen because the page's
-    requests are far shorter."""
-    idle_seconds: float = 15.0
-    """s: a connection is closed if its client sends no byte for this time. Chosen because a browser
-    sends its request at once."""
-    longest_line: int = 2000
-    """Largest number of characters of a text answer; the rest is cut off. Chosen because a page can
-    show this many."""
-    token_bytes: int = 18
-    """Number of random bytes of the token in the address. Chosen because nobody can guess it."""
-
-
-VIEW_SERVER = ViewServerSettings()
 
 HEADERS = {
     "Cache-Control": "no-store",
@@ -198,7 +191,7 @@ class ViewServer:
         bench: "Callable[[str, dict[str, Any]], bytes] | None" = None,
     ) -> None:
         self.switch = switch
-        self._token = secrets.token_urlsafe(VIEW_SERVER.token_bytes)
+        self._token = secrets.token_urlsafe(TOKEN_BYTES)
         content = {
             "": ("text/html; charset=utf-8", html.encode()),
             "scene.bin": ("application/octet-stream", packed),
@@ -253,7 +246,7 @@ class _Handler(BaseHTTPRequestHandler):
     names: set[str]
     root: str
 
-    timeout = VIEW_SERVER.idle_seconds
+    timeout = IDLE_SECONDS
 
     def parse_request(self) -> bool:
         """Refuse requests of HTTP/0.9, whose answers have no headers."""
@@ -323,7 +316,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _read_request(self) -> dict[str, Any]:
         length = int(self.headers.get("Content-Length") or 0)
-        if not 0 < length <= VIEW_SERVER.most_request_bytes:
+        if not 0 < length <= MOST_REQUEST_BYTES:
             raise TkambError("the request has no bytes, or too many")
         content = json.loads(self.rfile.read(length))
         if not isinstance(content, dict):
@@ -346,7 +339,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _send_line(self, status: HTTPStatus, words: str) -> None:
         """Send one line of text."""
-        line = " ".join(words.split())[: VIEW_SERVER.longest_line]
+        line = " ".join(words.split())[:LONGEST_LINE]
         # a name in the request may contain characters that UTF-8 cannot encode
         self._send(status, "text/plain; charset=utf-8", line.encode(errors="backslashreplace"))
 

@@ -6,7 +6,6 @@ is not measured. The foot is drawn level with the floor and points forward with 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -57,18 +56,12 @@ SOLE = (
 sole, to the right) and a radius."""
 
 
-@dataclass(frozen=True)
-class ViewSolidSettings:
-    """Sizes of the floor and the ankle in the viewer."""
+# mm: radius of the ball at the ankle. Chosen by eye.
+ANKLE_RADIUS_MM = 20.0
+# m: distance from the ankle to the floor's centre in front of it. Chosen because it is about the
+# middle of a foot.
+PLATE_CENTRE = 60.0 * MILLIMETRE
 
-    ankle_radius_mm: float = 20.0
-    """mm: radius of the ball at the ankle. Chosen by eye."""
-    plate_centre: float = 60.0 * MILLIMETRE
-    """m: distance from the ankle to the floor's centre in front of it. Chosen because it is about
-    the middle of a foot."""
-
-
-VIEW_SOLID = ViewSolidSettings()
 
 PLATE = np.array([340.0, 5.0, 200.0]) * MILLIMETRE
 GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
@@ -240,14 +233,12 @@ def _floor_pose(geometry: KneeGeometry, tibia_in_laboratory: Array, floor: float
 
 
 def _floor_surface() -> Surface:
-    return box(PLATE, "floor").moved(
-        pose(np.eye(3), [VIEW_SOLID.plate_centre, -0.5 * PLATE[1], 0.0])
-    )
+    return box(PLATE, "floor").moved(pose(np.eye(3), [PLATE_CENTRE, -0.5 * PLATE[1], 0.0]))
 
 
 def _foot_surface(height: float) -> Surface:
     """Return a foot whose ankle is `height` (m) above the sole."""
-    ankle = (0.0, height / MILLIMETRE, 0.0, VIEW_SOLID.ankle_radius_mm)
+    ankle = (0.0, height / MILLIMETRE, 0.0, ANKLE_RADIUS_MM)
     sole, leg = _hull((*SOLE, INSTEP)), _hull((INSTEP, ankle))
     faces = np.concatenate([sole.faces, leg.faces + len(sole.vertices)])
     return Surface(np.concatenate([sole.vertices, leg.vertices]), faces, "foot")

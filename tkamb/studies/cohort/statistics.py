@@ -25,16 +25,9 @@ CYCLE_BIN, WHOLE_CYCLE = 10.0, 100.0
 AXES = ("flexion_deg", CYCLE)
 
 
-@dataclass(frozen=True)
-class CohortStatisticsSettings:
-    """Statistics over the runs of a cohort."""
-
-    bin_tolerance: float = 1e-9
-    """Distance from the upper edge of a bin, relative to its width, within which a value belongs to
-    the next bin. Chosen above round-off: 60 deg converted from radians is 59.99999999999999."""
-
-
-COHORT_STATISTICS = CohortStatisticsSettings()
+# Distance from the upper edge of a bin, relative to its width, within which a value belongs to the
+# next bin. Chosen above round-off: 60 deg converted from radians is 59.99999999999999.
+BIN_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,10 +155,8 @@ def _computed(outcome: Outcome) -> dict[str, Array]:
 
 def _bin_indices(values: Array, axis: str, width: float) -> NDArray[np.int64]:
     """Return the bin number of each frame. 100 % of the cycle belongs to the last bin."""
-    result = np.floor(values / width + COHORT_STATISTICS.bin_tolerance).astype(int)
-    end = axis == CYCLE and np.isclose(
-        values, WHOLE_CYCLE, rtol=0, atol=COHORT_STATISTICS.bin_tolerance * width
-    )
+    result = np.floor(values / width + BIN_TOLERANCE).astype(int)
+    end = axis == CYCLE and np.isclose(values, WHOLE_CYCLE, rtol=0, atol=BIN_TOLERANCE * width)
     return np.where(end, result - 1, result)
 
 

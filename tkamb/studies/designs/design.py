@@ -25,19 +25,12 @@ PHI_REACH, Z_REACH = np.radians(30.0), 9.0
 """rad, mm: half the size of the search area."""
 
 
-@dataclass(frozen=True)
-class DesignTouchSettings:
-    """Search for the pose at which both condyles of a design touch."""
-
-    halvings: int = 18
-    """Number of times that the search area around the lowest point of a condyle is halved. Chosen
-    because 18 leave 4e-6 of the area's size."""
-    largest_adduction: float = 0.04
-    """rad: largest difference of the adduction from the initial guess. Chosen because both condyles
-    touch within it."""
-
-
-DESIGN_TOUCH = DesignTouchSettings()
+# Number of times that the search area around the lowest point of a condyle is halved. Chosen
+# because 18 leave 4e-6 of the area's size.
+HALVINGS = 18
+# rad: largest difference of the adduction from the initial guess. Chosen because both condyles
+# touch within it.
+LARGEST_ADDUCTION = 0.04
 
 
 @dataclass(frozen=True)
@@ -68,7 +61,7 @@ class Articulation:
         phi, z = flexion, side * self.femoral.ridge_half
         reach = np.array([PHI_REACH, Z_REACH])
         step = np.linspace(-1.0, 1.0, 9)
-        for _ in range(DESIGN_TOUCH.halvings):
+        for _ in range(HALVINGS):
             phis = np.clip(phi + reach[0] * step[:, None], *self.femoral.profile.range)
             zs = z + reach[1] * step[None, :]
             points = self.femoral.surface(phis, zs) @ pose[:3, :3].T + pose[:3, 3]
@@ -100,7 +93,7 @@ class Articulation:
             gaps = [self.lowest(femoral, flexion, side)[0] for side in (LATERAL, MEDIAL)]
             return gaps[0] - gaps[1]
 
-        bounds = guess - DESIGN_TOUCH.largest_adduction, guess + DESIGN_TOUCH.largest_adduction
+        bounds = guess - LARGEST_ADDUCTION, guess + LARGEST_ADDUCTION
         adduction = brentq(difference, *bounds, xtol=1e-12)
         femoral = pose(adduction)
         medial, lateral = (self.lowest(femoral, flexion, side) for side in (MEDIAL, LATERAL))

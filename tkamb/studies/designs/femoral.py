@@ -8,7 +8,7 @@ it. If the J-curves of the two condyles differ, the surface blends from one to t
 groove.
 
 A posterior-stabilised component has a cam: a cylinder that joins the two walls of the box. The
-cylinder is exact up to `CAM.flange_mm` from a wall. From there it widens to the edge of an
+cylinder is exact up to `FLANGE_MM` from a wall. From there it widens to the edge of an
 opening in the wall, so the mesh is one closed body without self-intersection.
 """
 
@@ -24,24 +24,16 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.studies.designs import solids
 
-
-@dataclass(frozen=True)
-class CamSettings:
-    """The cam of a posterior-stabilised design."""
-
-    sides: int = 96
-    """Number of facets around a cam. Chosen because the facets lie within 0.05 % of the radius."""
-    stations: int = 13
-    """Number of rings of vertices along the cam. Chosen for triangles about as long as wide."""
-    flange_mm: float = 1.0
-    """mm: distance from a wall of the box to the cylinder. Chosen to leave room to widen it."""
-    window_deg: float = 22.0
-    """deg: half the angle that the cam's opening in a wall subtends at the origin."""
-    wall_tolerance_mm: float = 1e-6
-    """mm: distance within which a vertex lies in the plane of a wall. Chosen above round-off."""
-
-
-CAM = CamSettings()
+# Number of facets around a cam. Chosen because the facets lie within 0.05 % of the radius.
+SIDES = 96
+# Number of rings of vertices along the cam. Chosen for triangles about as long as wide.
+STATIONS = 13
+# mm: distance from a wall of the box to the cylinder. Chosen to leave room to widen it.
+FLANGE_MM = 1.0
+# deg: half the angle that the cam's opening in a wall subtends at the origin.
+WINDOW_DEG = 22.0
+# mm: distance within which a vertex lies in the plane of a wall. Chosen above round-off.
+WALL_TOLERANCE_MM = 1e-6
 
 
 Ids = NDArray[np.int64]
@@ -62,11 +54,11 @@ class Cam:
     radius: float
 
     def rings(self, half_length: float) -> Array:
-        """Return points (`CAM.stations`, `CAM.sides`, 3) on the cylinder within ±half_length."""
-        turn = np.linspace(0.0, 2.0 * np.pi, CAM.sides, endpoint=False)
+        """Return points (`STATIONS`, `SIDES`, 3) on the cylinder within ±half_length."""
+        turn = np.linspace(0.0, 2.0 * np.pi, SIDES, endpoint=False)
         x = self.centre_ap + self.radius * np.cos(turn)
         y = self.centre_si + self.radius * np.sin(turn)
-        z = np.linspace(-half_length, half_length, CAM.stations)[:, None]
+        z = np.linspace(-half_length, half_length, STATIONS)[:, None]
         return np.stack(np.broadcast_arrays(x, y, z), axis=-1)
 
 
@@ -84,15 +76,15 @@ def joined(cam: Cam, box_half: float, vertices: Array, faces: Ids) -> tuple[Arra
     """
     cam_direction = np.arctan2(-cam.centre_ap, -cam.centre_si)
     angle = np.degrees(np.arctan2(-vertices[:, 0], -vertices[:, 1]) - cam_direction)
-    near = np.abs((angle + 180.0) % 360.0 - 180.0) <= CAM.window_deg
+    near = np.abs((angle + 180.0) % 360.0 - 180.0) <= WINDOW_DEG
     loops = []
     for wall in (-box_half, box_half):
-        inside = near & (np.abs(vertices[:, 2] - wall) < CAM.wall_tolerance_mm)
+        inside = near & (np.abs(vertices[:, 2] - wall) < WALL_TOLERANCE_MM)
         window = inside[faces].all(axis=1)
         loops.append(_outline(vertices, faces[window]))
         faces = faces[~window]
-    rings = cam.rings(box_half - CAM.flange_mm)
-    ids = len(vertices) + np.arange(rings.shape[0] * CAM.sides).reshape(-1, CAM.sides)
+    rings = cam.rings(box_half - FLANGE_MM)
+    ids = len(vertices) + np.arange(rings.shape[0] * SIDES).reshape(-1, SIDES)
     vertices = np.concatenate([vertices, rings.reshape(-1, 3)])
     tube = [loops[0], *ids, loops[1]]
     sleeves = [_between(vertices, a, b) for a, b in pairwise(tube)]

@@ -13,17 +13,9 @@ from tkamb.geometry.frames import Array
 from tkamb.studies.designs import solids
 from tkamb.studies.designs.femoral import rounded_edge
 
-
-@dataclass(frozen=True)
-class InsertBlendSettings:
-    """Inserts with dishes of unequal radii."""
-
-    blend_half_width: float = 8.0
-    """mm: distance from the middle within which unequal dishes blend. Chosen because contacts lie
-    outside it."""
-
-
-INSERT_BLEND = InsertBlendSettings()
+# mm: distance from the middle within which unequal dishes blend. Chosen because contacts lie
+# outside it.
+BLEND_HALF_WIDTH = 8.0
 
 
 @dataclass(frozen=True)
@@ -141,7 +133,7 @@ class Insert:
         medial = self._arc(x, self.medial_dish_radii)
         if self.medial_dish_radii == self.lateral_dish_radii:
             return medial
-        s = np.clip(0.5 + 0.5 * z / INSERT_BLEND.blend_half_width, 0.0, 1.0)
+        s = np.clip(0.5 + 0.5 * z / BLEND_HALF_WIDTH, 0.0, 1.0)
         lateral = s * s * (3.0 - 2.0 * s)
         return (1.0 - lateral) * medial + lateral * self._arc(x, self.lateral_dish_radii)
 

@@ -18,7 +18,7 @@ from tkamb.run.discrepancy import (
     discrepancy_of,
     load_of,
 )
-from tkamb.run.results import PERCENTILES, STATISTICS_LIMITS
+from tkamb.run.results import MAX_FAILED_SHARE, MIN_SAMPLES, PERCENTILES
 from tkamb.run.status import out_of_equilibrium
 
 ENDS = ("p05", "p95")
@@ -47,8 +47,8 @@ def percentiles(values: Array, failed: np.ndarray | None = None) -> dict[str, Ar
     new draw then lies between p05 and p95 with a probability of 0.90 for any n. The usual rank
     1 + p (n - 1) gives only 0.81 for 20 samples and 0.87 for 60.
 
-    The result is NaN if fewer than `STATISTICS_LIMITS.min_samples` values are finite, or if more
-    than `STATISTICS_LIMITS.max_failed_share` of the samples failed.
+    The result is NaN if fewer than `MIN_SAMPLES` values are finite, or if more
+    than `MAX_FAILED_SHARE` of the samples failed.
 
     Args:
         values: values of the samples, shape (n, ...); NaN for a missing value.
@@ -63,9 +63,9 @@ def percentiles(values: Array, failed: np.ndarray | None = None) -> dict[str, Ar
         limits = np.nanpercentile(
             values, list(PERCENTILES.values()), axis=0, method=QUANTILE_METHOD
         )
-    hidden = np.isfinite(values).sum(axis=0) < STATISTICS_LIMITS.min_samples
+    hidden = np.isfinite(values).sum(axis=0) < MIN_SAMPLES
     if failed is not None:
-        hidden = hidden | (failed.mean(axis=0) > STATISTICS_LIMITS.max_failed_share)
+        hidden = hidden | (failed.mean(axis=0) > MAX_FAILED_SHARE)
     limits[:, hidden] = np.nan
     return dict(zip(PERCENTILES, limits, strict=True))
 
@@ -307,10 +307,10 @@ def influences(
 def _regression(y: Array, errors: Array) -> tuple[Array, Array, float] | None:
     """Return the slopes (d,), the explained variance of each input (d,), and the variance of y.
 
-    None if fewer than `STATISTICS_LIMITS.min_samples` values are finite.
+    None if fewer than `MIN_SAMPLES` values are finite.
     """
     finite, count = np.isfinite(y), errors.shape[1]
-    if finite.sum() < STATISTICS_LIMITS.min_samples:
+    if finite.sum() < MIN_SAMPLES:
         return None
     y, x = y[finite], errors[finite]
     variance = float(y.var())

@@ -24,7 +24,7 @@ from tkamb.run.claims import peaks
 from tkamb.run.columns import KINDS
 from tkamb.run.guard import interrupt_as_such
 from tkamb.run.recorder import Shard, Shards
-from tkamb.run.results import STATISTICS_LIMITS, Results
+from tkamb.run.results import MIN_SAMPLES, Results
 from tkamb.run.results_folder import (
     BANDS_NAME,
     INDICES_NAME,
@@ -210,11 +210,11 @@ def estimate_uncertainty(
     if isinstance(scene, str | Path):
         scene_path, scene = scene, load_scene(scene)
     crew = PoolOptions(workers, dask)
-    if not STATISTICS_LIMITS.min_samples <= samples <= MOST_SAMPLES:
+    if not MIN_SAMPLES <= samples <= MOST_SAMPLES:
         raise InputError(
             f"cannot be {samples}",
             "samples",
-            f"give a number from {STATISTICS_LIMITS.min_samples} to {MOST_SAMPLES}",
+            f"give a number from {MIN_SAMPLES} to {MOST_SAMPLES}",
         )
     if directory is None and resume:
         raise InputError("needs the folder of the earlier run", "resume", "give a directory")

@@ -12,7 +12,7 @@ import numpy as np
 from tkamb.geometry.frames import Array
 from tkamb.io.scene import Scene
 from tkamb.io.scene.case import load_case
-from tkamb.run.results import STATISTICS_LIMITS
+from tkamb.run.results import MIN_SAMPLES
 from tkamb.run.simulation import chosen_frames
 from tkamb.run.workers import PoolOptions, Progress, Task
 from tkamb.studies.uncertainty.bands import varies
@@ -61,7 +61,7 @@ def sobol_indices(
     where sum y² is the mean over A and B. Numerators and denominators are summed over the frames
     (Gamboa et al. 2014). Rows with a failed sample are omitted. Standard errors come from a
     bootstrap over the rows. A result has no indices if it does not vary, or if fewer than
-    `STATISTICS_LIMITS.min_samples` rows remain.
+    `MIN_SAMPLES` rows remain.
 
     Args:
         results: names of the m results.
@@ -96,7 +96,7 @@ def _index(
 ) -> SobolIndex | None:
     """Return the indices of one input from values (n, f); None: too few rows, or no variance."""
     finite = np.isfinite(a) & np.isfinite(b) & np.isfinite(crossed)
-    enough = finite.sum(axis=0) >= STATISTICS_LIMITS.min_samples
+    enough = finite.sum(axis=0) >= MIN_SAMPLES
     if not enough.any():
         return None
     finite = finite[:, enough]
@@ -127,16 +127,8 @@ SCREENED = (
 )
 
 
-@dataclass(frozen=True)
-class ScreeningSettings:
-    """Printed table of a screening."""
-
-    least_share: float = 0.01
-    """Share of the largest change of a result. Inputs with smaller changes are counted, but not
-    listed."""
-
-
-SCREENING = ScreeningSettings()
+# Share of the largest change of a result. Inputs with smaller changes are counted, but not listed.
+LEAST_SHARE = 0.01
 
 
 @dataclass(frozen=True)
@@ -227,7 +219,7 @@ def _of_result(
 def screen_lines(rows: Sequence[Screened], width: int = 20) -> list[str]:
     """Return the lines of the printed tornado table, with a bar for each input.
 
-    Inputs with less than `SCREENING.least_share` of the largest change are counted in one line.
+    Inputs with less than `LEAST_SHARE` of the largest change are counted in one line.
     `rows` come from `screen`; `width` is the length of the longest bar in characters.
     """
     lines: list[str] = []
@@ -238,14 +230,14 @@ def screen_lines(rows: Sequence[Screened], width: int = 20) -> list[str]:
         sizes = np.abs([[row.minus, row.plus] for row in group])
         largest = np.nanmax(sizes) if np.isfinite(sizes).any() else 0.0
         # NaN of a failed frame is not small, so its input is listed
-        small = (sizes < SCREENING.least_share * largest).all(axis=1) | (sizes == 0.0).all(axis=1)
+        small = (sizes < LEAST_SHARE * largest).all(axis=1) | (sizes == 0.0).all(axis=1)
         for row in (row for row, hidden in zip(group, small, strict=True) if not hidden):
             bar = _bar(row, largest, width)
             lines.append(
                 f"  {_named(row):<{names}} {_change(row.minus)} {_change(row.plus)}  {bar}"
             )
         if small.any():
-            share = f"{SCREENING.least_share:.0%}"
+            share = f"{LEAST_SHARE:.0%}"
             lines.append(
                 f"  {small.sum()} more inputs: each less than {share} of the largest change"
             )

@@ -17,7 +17,7 @@ from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_coordinates, kne
 from tkamb.io.scene.uncertainty import UncertaintyTable
 from tkamb.run.guard import interrupt_as_such
 from tkamb.run.recorder import Shard, Shards
-from tkamb.run.results import STATISTICS_LIMITS
+from tkamb.run.results import MIN_SAMPLES
 from tkamb.run.workers import Numbered, PoolOptions, Task
 from tkamb.studies.uncertainty.bands import percentiles
 from tkamb.studies.uncertainty.inputs import Draw, VariedInput
@@ -341,10 +341,9 @@ def check_samples(samples: int) -> None:
     Raises:
         InputError: the number is out of range.
     """
-    if samples and not STATISTICS_LIMITS.min_samples <= samples <= WEAR_BAND.max_samples:
+    if samples and not MIN_SAMPLES <= samples <= WEAR_BAND.max_samples:
         raise InputError(
             f"cannot be {samples}",
             "--samples",
-            f"give a number from {STATISTICS_LIMITS.min_samples} to {WEAR_BAND.max_samples}, or 0 "
-            "for no bands",
+            f"give a number from {MIN_SAMPLES} to {WEAR_BAND.max_samples}, or 0 for no bands",
         )

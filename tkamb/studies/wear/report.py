@@ -41,22 +41,16 @@ PROPORTIONAL = ("volume_mm3", "mass_mg", "max_depth_mm")
 """Columns that are proportional to the wear factor if the change of the shape is neglected."""
 
 
-@dataclass(frozen=True)
-class WearReportSettings:
-    """Limits above which a wear report adds a question."""
+# Relative change of the volume of a cycle with half as many frames. Above it the report asks for
+# more frames. Chosen below the error of a wear law.
+MAX_FRAME_CHANGE = 0.02
+# Relative correction of the force of a map. Above it the report asks for a finer resolution.
+# Chosen below the error of a wear law.
+MAX_MAP_CORRECTION = 0.05
+# Ratio to the published wear rates. The report asks about rates above the highest published rate
+# times the ratio, or below the lowest over the ratio.
+MAX_PUBLISHED_RATIO = 3.0
 
-    max_frame_change: float = 0.02
-    """Relative change of the volume of a cycle with half as many frames. Above it the report asks
-    for more frames. Chosen below the error of a wear law."""
-    max_map_correction: float = 0.05
-    """Relative correction of the force of a map. Above it the report asks for a finer resolution.
-    Chosen below the error of a wear law."""
-    max_published_ratio: float = 3.0
-    """Ratio to the published wear rates. The report asks about rates above the highest published
-    rate times the ratio, or below the lowest over the ratio."""
-
-
-WEAR_REPORT = WearReportSettings()
 
 PUBLISHED_RATES = (1.6, 4.4)
 """mm³ per million cycles: lowest and highest rate of a whole knee in two tests, Dreyer et al.
@@ -192,12 +186,12 @@ class WearReport:
         """Return the questions and warnings that the report prints."""
         questions = [] if not self.material.caution else [self.material.caution]
         questions += self.case.motion.questions
-        if self.first.frames_change > WEAR_REPORT.max_frame_change:
+        if self.first.frames_change > MAX_FRAME_CHANGE:
             questions.append(
                 f"half the frames per cycle change the volume by {self.first.frames_change:.1%}"
                 ": increase --frames-per-cycle"
             )
-        if self.state.map_error > WEAR_REPORT.max_map_correction:
+        if self.state.map_error > MAX_MAP_CORRECTION:
             questions.append(
                 f"pressure maps were scaled by up to {self.state.map_error:.0%} to sum to their "
                 "load: use a finer resolution"
@@ -208,11 +202,7 @@ class WearReport:
                 "although they were halved: increase --updates"
             )
         low, high = PUBLISHED_RATES
-        if (
-            not low / WEAR_REPORT.max_published_ratio
-            <= self.rate
-            <= high * WEAR_REPORT.max_published_ratio
-        ):
+        if not low / MAX_PUBLISHED_RATIO <= self.rate <= high * MAX_PUBLISHED_RATIO:
             questions.append(
                 f"{self.rate:.3g} mm3 per million cycles is far from the measured {low:g} (ISO) to "
                 f"{high:g} (in-vivo loads) mm3 of a whole knee (Dreyer 2023): check the wear factor"

@@ -16,7 +16,7 @@ import numpy as np
 
 from tkamb import code_identity
 from tkamb.errors import InputError
-from tkamb.files import FILE_LIMITS, read_bytes, replaced_file, undamaged
+from tkamb.files import MESH_BYTES, read_bytes, replaced_file, undamaged
 from tkamb.io.scene import Scene
 from tkamb.io.scene.tables import WearTable
 from tkamb.run.guard import interrupt_as_such
@@ -85,7 +85,7 @@ def kept_state(folder: Path, identity: str) -> WearState | None:
     if not path.is_file():
         return None
     with undamaged(path, "leave out resume=True to begin again"):
-        content = read_arrays(read_bytes(path, FILE_LIMITS.mesh_bytes))
+        content = read_arrays(read_bytes(path, MESH_BYTES))
         if str(content.pop("identity")) != identity:
             what = "is of another simulation: bodies, motion, law, numbers or code differ"
             raise InputError(what, path, "leave out resume=True, or choose another directory")

@@ -161,19 +161,12 @@ def factor_memory(
     return MEMORY_NEED.entry_bytes * entries + max(peak, itemsize * (stored + response))
 
 
-@dataclass(frozen=True)
-class OperatorSettings:
-    """The linear operator of a lattice."""
-
-    test_vector_seed: int = 20_240_501
-    """Seed of the random vectors that measure the operator's error. It is fixed, so that runs are
-    reproducible."""
-    max_fronts_ahead: int = 128
-    """Fronts that may wait in memory for the computation of their compliance. Larger: more memory.
-    Smaller: the factorisation waits more often."""
-
-
-OPERATOR = OperatorSettings()
+# Seed of the random vectors that measure the operator's error. It is fixed, so that runs are
+# reproducible.
+TEST_VECTOR_SEED = 20_240_501
+# Fronts that may wait in memory for the computation of their compliance. Larger: more memory.
+# Smaller: the factorisation waits more often.
+MAX_FRONTS_AHEAD = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,8 +362,8 @@ def prepare_operator(
         for member, front in enumerate(fronts):
             boundaries.append(front.boundary)
             waiting.append(thread.submit(add_to_response, member, front))
-            if member >= OPERATOR.max_fronts_ahead:
-                waiting[member - OPERATOR.max_fronts_ahead].result()
+            if member >= MAX_FRONTS_AHEAD:
+                waiting[member - MAX_FRONTS_AHEAD].result()
     rows = [future.result() for future in waiting]
     del waiting
     factor = CholeskyFactor.of(order, starts, tree.parent, boundaries, rows)
@@ -394,7 +387,7 @@ def operator_error(operator: ElasticOperator, solid: Solid) -> float:
         operator: operator to check.
         solid: solid that the operator should belong to.
     """
-    generator = np.random.default_rng(OPERATOR.test_vector_seed)
+    generator = np.random.default_rng(TEST_VECTOR_SEED)
     nodes, shape = operator.contact_nodes, solid.nodes.shape
     pressed, touched = np.zeros(shape), np.zeros(shape)
     pressed[nodes, 1] = -1.0

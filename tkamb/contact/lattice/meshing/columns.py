@@ -27,23 +27,15 @@ from tkamb.geometry.height_field import Intervals, inside_intervals
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 
-
-@dataclass(frozen=True)
-class LayerSettings:
-    """The layers of cells below the articular surface."""
-
-    max_edge_ratio: float = 1.4
-    """1: longest over shortest edge of a cell before its nodes are moved onto the surface. Chosen
-    because flatter hexahedra are too stiff in bending."""
-    max_slope: float = 1.0
-    """1: steepest slope, rise over run, that the layers follow (45 deg). Chosen because steeper
-    layers would shear the cells."""
-    max_low_share: float = 0.01
-    """1: largest share of columns that are too low for the layers. Chosen because a few columns at
-    the rim may be too low."""
-
-
-LAYER = LayerSettings()
+# 1: longest over shortest edge of a cell before its nodes are moved onto the surface. Chosen
+# because flatter hexahedra are too stiff in bending.
+MAX_EDGE_RATIO = 1.4
+# 1: steepest slope, rise over run, that the layers follow (45 deg). Chosen because steeper layers
+# would shear the cells.
+MAX_SLOPE = 1.0
+# 1: largest share of columns that are too low for the layers. Chosen because a few columns at the
+# rim may be too low.
+MAX_LOW_SHARE = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +80,7 @@ def follow_top(top: Array, lowest: float, spacing: Array) -> Levels:
         spacing: spacing of the grid, m, shape (3,).
     """
     across = spacing[[0, 2]]
-    thinnest, thickest = across.max() / LAYER.max_edge_ratio, across.min() * LAYER.max_edge_ratio
+    thinnest, thickest = across.max() / MAX_EDGE_RATIO, across.min() * MAX_EDGE_RATIO
     layers = _reference_layers(top[np.isfinite(top)], thinnest, thickest, spacing[1])
     clipped = np.clip(top, layers * thinnest, layers * thickest)
     reference = _filled(_slope_limited(_smooth_part(clipped, across), across))
@@ -107,7 +99,7 @@ def _reference_layers(top: Array, thinnest: float, thickest: float, spacing: flo
     """
     candidates = np.arange(1, int(np.ceil(top.max() / thinnest)) + 1)
     stepped = np.array([np.mean(top < (n - 0.5) * thinnest) for n in candidates])
-    candidates = candidates[stepped <= max(LAYER.max_low_share, stepped.min())]
+    candidates = candidates[stepped <= max(MAX_LOW_SHARE, stepped.min())]
     covered = [np.mean((top >= n * thinnest) & (top <= n * thickest)) for n in candidates]
     best = candidates[np.isclose(covered, np.max(covered), atol=1e-3)]
     return int(best[np.argmin(np.abs(best - np.median(top) / spacing))])
@@ -116,12 +108,12 @@ def _reference_layers(top: Array, thinnest: float, thickest: float, spacing: flo
 def _smooth_part(height: Array, across: Array) -> Array:
     """Return the heights of the largest smooth patch of columns, and NaN elsewhere.
 
-    Slopes between neighbours of a patch are at most `LAYER.max_slope`.
+    Slopes between neighbours of a patch are at most `MAX_SLOPE`.
     """
     number = np.arange(height.size).reshape(height.shape)
     links = []
     for axis in range(2):
-        gentle = np.abs(np.diff(height, axis=axis)) <= LAYER.max_slope * across[axis] * (1.0 + 1e-9)
+        gentle = np.abs(np.diff(height, axis=axis)) <= MAX_SLOPE * across[axis] * (1.0 + 1e-9)
         low = np.delete(number, -1, axis=axis)[gentle]
         high = np.delete(number, 0, axis=axis)[gentle]
         links.append(np.stack([low, high]))
@@ -134,12 +126,12 @@ def _smooth_part(height: Array, across: Array) -> Array:
 
 
 def _slope_limited(height: Array, across: Array) -> Array:
-    """Return the largest function below `height` whose slope is at most `LAYER.max_slope`."""
+    """Return the largest function below `height` whose slope is at most `MAX_SLOPE`."""
     result = np.where(np.isfinite(height), height, np.inf)
     while True:
         before = result.copy()
         for axis in range(2):
-            rise = LAYER.max_slope * across[axis]
+            rise = MAX_SLOPE * across[axis]
             along_axis = np.moveaxis(result, axis, 0)
             along_axis[1:] = np.minimum(along_axis[1:], along_axis[:-1] + rise)
             along_axis[:-1] = np.minimum(along_axis[:-1], along_axis[1:] + rise)
@@ -179,28 +171,19 @@ def _filled(height: Array) -> Array:
 Nodes = tuple[Index, ...]
 
 
-@dataclass(frozen=True)
-class ColumnSettings:
-    """Tolerances with which nodes are placed on the surface."""
-
-    tie: float = 1e-6
-    """Cells: distances this near to half a cell count as half a cell. Chosen above rounding
-    errors."""
-    side_tolerance: float = 0.02
-    """Cells: vertices this near to the bounding box lie on its side. Chosen above the noise of
-    meshes."""
-    wall_normal_y: float = 0.05
-    """1: a triangle with a smaller y of its normal (87 deg) belongs to a wall. Chosen because no
-    articular surface is that steep."""
-    wall_inset: float = 0.02
-    """Cells: distance inside a wall at which a missed vertical ray is repeated. Chosen because a
-    ray exactly on a rough wall may miss the part."""
-    max_height_change: float = 0.75
-    """Cells: largest change of a surface's height when a node moves sideways. If it is larger, the
-    ray has hit another surface. Chosen because slopes that cells follow cause smaller changes."""
-
-
-COLUMN = ColumnSettings()
+# Cells: distances this near to half a cell count as half a cell. Chosen above rounding errors.
+COLUMN_TIE = 1e-6
+# Cells: vertices this near to the bounding box lie on its side. Chosen above the noise of meshes.
+SIDE_TOLERANCE = 0.02
+# 1: a triangle with a smaller y of its normal (87 deg) belongs to a wall. Chosen because no
+# articular surface is that steep.
+WALL_NORMAL_Y = 0.05
+# Cells: distance inside a wall at which a missed vertical ray is repeated. Chosen because a ray
+# exactly on a rough wall may miss the part.
+WALL_INSET = 0.02
+# Cells: largest change of a surface's height when a node moves sideways. If it is larger, the ray
+# has hit another surface. Chosen because slopes that cells follow cause smaller changes.
+MAX_HEIGHT_CHANGE = 0.75
 
 
 @dataclass(eq=False)
@@ -288,17 +271,17 @@ def interval_ends(low: Array, high: Array, count: int) -> Ends:
         high: upper ends (m,).
         count: number of nodes of a line.
     """
-    first = np.floor(low + 0.5 + COLUMN.tie).astype(np.int64)
-    last = np.ceil(high - 0.5 - COLUMN.tie).astype(np.int64)
-    inside = np.ceil(high - COLUMN.tie) - np.floor(low + COLUMN.tie) - 1
-    thick = high - low > 0.5 + COLUMN.tie
+    first = np.floor(low + 0.5 + COLUMN_TIE).astype(np.int64)
+    last = np.ceil(high - 0.5 - COLUMN_TIE).astype(np.int64)
+    inside = np.ceil(high - COLUMN_TIE) - np.floor(low + COLUMN_TIE) - 1
+    thick = high - low > 0.5 + COLUMN_TIE
     single = ~thick & (inside <= 1)
     thin = single & (inside == 1)
     joined = thick & (first >= last)
     upwards = (np.abs(low - first) <= np.abs(high - first)) & (first < count - 1)
     last = np.where(joined, first + upwards, last)
     first = np.where(joined, last - 1, first)
-    middle = np.where(thin, np.floor(low + COLUMN.tie) + 1, np.round(0.5 * (low + high))).astype(
+    middle = np.where(thin, np.floor(low + COLUMN_TIE) + 1, np.round(0.5 * (low + high))).astype(
         np.int64
     )
     return Ends(np.where(single, middle, first), np.where(single, middle, last), single, thin)
@@ -312,8 +295,8 @@ def _grid_line(surface: Surface, axis: int, spacing: float) -> Array:
     lower, upper = surface.bounds[:, axis]
     line = np.linspace(lower, upper, round((upper - lower) / spacing) + 1)
     values = surface.vertices[:, axis]
-    line[0] = values[values <= lower + COLUMN.side_tolerance * spacing].max()
-    line[-1] = values[values >= upper - COLUMN.side_tolerance * spacing].min()
+    line[0] = values[values <= lower + SIDE_TOLERANCE * spacing].max()
+    line[-1] = values[values >= upper - SIDE_TOLERANCE * spacing].min()
     return line
 
 
@@ -342,7 +325,7 @@ def _without_narrow_gaps(
 ) -> tuple[Intervals, Array, Array, int]:
     """Join neighbouring intervals of a line if their facing ends have the same node."""
     same = (np.diff(intervals.first) == 0) & (np.diff(intervals.second) == 0)
-    joined = same & (np.floor(low[1:] + 0.5 + COLUMN.tie) <= np.ceil(high[:-1] - 0.5 - COLUMN.tie))
+    joined = same & (np.floor(low[1:] + 0.5 + COLUMN_TIE) <= np.ceil(high[:-1] - 0.5 - COLUMN_TIE))
     begins = np.flatnonzero(np.append(True, ~joined))
     ends = np.append(begins[1:], len(low)) - 1
     merged = Intervals(
@@ -397,7 +380,7 @@ def refired_inwards(
     missed = np.flatnonzero(~np.isfinite(height))
     if missed.size:
         step = inward[missed] / np.linalg.norm(inward[missed], axis=1, keepdims=True)
-        target[missed[:, None], [0, 2]] += COLUMN.wall_inset * field.spacing[[0, 2]] * step
+        target[missed[:, None], [0, 2]] += WALL_INSET * field.spacing[[0, 2]] * step
         again = tuple(index[missed] for index in nodes)
         height[missed] = refired(field, again, target[missed], rays)
     return height
@@ -407,7 +390,7 @@ def refired(field: NodeField, nodes: Nodes, target: Array, rays: RayCaster) -> A
     """Return the heights (n,), m, of nodes after a move sideways to `target` (n, 3).
 
     Ends of intervals stay on the surface, and other nodes keep their height. The result is NaN
-    where the height of the surface changes by more than `COLUMN.max_height_change`.
+    where the height of the surface changes by more than `MAX_HEIGHT_CHANGE`.
     """
     height = field.points[..., 1][nodes]
     for end, facing in ((field.upper_end[nodes], 1.0), (field.lower_end[nodes], -1.0)):
@@ -415,14 +398,14 @@ def refired(field: NodeField, nodes: Nodes, target: Array, rays: RayCaster) -> A
         base = target[rows].copy()
         base[:, 1] = rays.surface.bounds[0, 1] - field.spacing[1]
         ray, t, face = rays.all(base, (0.0, 1.0, 0.0))
-        matches = rays.surface.face_normals[face, 1] * facing > COLUMN.wall_normal_y
+        matches = rays.surface.face_normals[face, 1] * facing > WALL_NORMAL_Y
         ray, y = ray[matches], base[ray[matches], 1] + t[matches]
         change = np.abs(y - height[rows[ray]])
         # Of each ray, the hit with the smallest change of height is used.
         order = np.lexsort((change, ray))
         with_hit, nearest = np.unique(ray[order], return_index=True)
         value = np.full(len(rows), np.nan)
-        close = change[order][nearest] <= COLUMN.max_height_change * field.spacing[1]
+        close = change[order][nearest] <= MAX_HEIGHT_CHANGE * field.spacing[1]
         value[with_hit[close]] = y[order][nearest][close]
         height[rows] = value
     return height

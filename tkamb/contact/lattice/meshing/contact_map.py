@@ -12,20 +12,13 @@ from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 
+# m: height above a node at which the ray to its triangle begins. Chosen above the rounding of a
+# mesh and below the next surface.
+RAY_START_HEIGHT = 1e-4
+# m: a node this near to a triangle lies on it. Chosen because coordinates in single precision are
+# rounded by some 1e-9 m.
+ON_MESH_DISTANCE = 1e-6
 
-@dataclass(frozen=True)
-class ContactMapSettings:
-    """The search for the triangle of the insert under a contact node."""
-
-    ray_start_height: float = 1e-4
-    """m: height above a node at which the ray to its triangle begins. Chosen above the rounding of
-    a mesh and below the next surface."""
-    on_mesh_distance: float = 1e-6
-    """m: a node this near to a triangle lies on it. Chosen because coordinates in single precision
-    are rounded by some 1e-9 m."""
-
-
-CONTACT_MAP = ContactMapSettings()
 
 GAUSS_POINTS = 0.5 + np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / (2 * np.sqrt(3.0))
 """The 2 x 2 Gauss points of a face, in [0, 1]². Their weights are equal."""
@@ -121,8 +114,8 @@ def _thickness(points: Array, rays: RayCaster, spacing: Array) -> Array:
 def _lift(points: Array, rays: RayCaster) -> Array:
     """Return the height of the smooth surface above the points, m; 0 for points off the mesh."""
     up = np.array([0.0, 1.0, 0.0])
-    distance, face, weights = rays.first_in_face(points + CONTACT_MAP.ray_start_height * up, -up)
-    on_mesh = np.abs(distance - CONTACT_MAP.ray_start_height) < CONTACT_MAP.on_mesh_distance
+    distance, face, weights = rays.first_in_face(points + RAY_START_HEIGHT * up, -up)
+    on_mesh = np.abs(distance - RAY_START_HEIGHT) < ON_MESH_DISTANCE
     lift = np.zeros(len(points))
     lift[on_mesh], _ = CurvedSurface.of(rays.surface).shift(face[on_mesh], weights[on_mesh], up)
     return lift

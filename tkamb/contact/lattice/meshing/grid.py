@@ -33,20 +33,13 @@ from tkamb.geometry.post import find_post
 from tkamb.geometry.surface import Surface
 from tkamb.units import MILLIMETRE
 
+# 1: smallest number of cells of a piece, relative to the largest piece. Smaller pieces are
+# omitted. Chosen because they are fragments of the rim.
+LEAST_PIECE_SHARE = 0.01
+# m: distance of the lines that measure the volume of overlapping bodies. Chosen because the error
+# of the volume is then below 0.1 %.
+LINE_SPACING = 2.5e-4
 
-@dataclass(frozen=True)
-class PieceSettings:
-    """Separate pieces of a lattice."""
-
-    least_piece_share: float = 0.01
-    """1: smallest number of cells of a piece, relative to the largest piece. Smaller pieces are
-    omitted. Chosen because they are fragments of the rim."""
-    line_spacing: float = 2.5e-4
-    """m: distance of the lines that measure the volume of overlapping bodies. Chosen because the
-    error of the volume is then below 0.1 %."""
-
-
-PIECE = PieceSettings()
 
 LOWER_FACE = 2
 """Row of `FACES` with a cell's lower corners."""
@@ -81,7 +74,7 @@ def standing_pieces(cells: Index, bottom: Mask) -> Mask:
     if not standing.any():
         standing[size.argmax()] = True
     largest = size[standing].max()
-    return (standing & (size >= PIECE.least_piece_share * largest))[piece]
+    return (standing & (size >= LEAST_PIECE_SHARE * largest))[piece]
 
 
 @dataclass(frozen=True)
@@ -150,11 +143,9 @@ def solid_volume(insert: Surface, centres: Array) -> float:
     if not (insert.winding.at(centres) > 1).any():
         return insert.volume
     low, high = insert.bounds
-    lines = [
-        np.arange(low[a] + PIECE.line_spacing / 2, high[a], PIECE.line_spacing) for a in (2, 0)
-    ]
+    lines = [np.arange(low[a] + LINE_SPACING / 2, high[a], LINE_SPACING) for a in (2, 0)]
     intervals = inside_intervals(insert, 1, *lines)
-    return float((intervals.upper - intervals.lower).sum() * PIECE.line_spacing**2)
+    return float((intervals.upper - intervals.lower).sum() * LINE_SPACING**2)
 
 
 def volume_error(nodes: Array, cells: Index, insert: Surface) -> float:
@@ -185,28 +176,21 @@ INTERNAL, CONTACT, BOTTOM, OTHER = 0, 1, 2, 3
 """Node classes: inside, top surface, flat bottom, other surfaces (walls, underside)."""
 
 
-@dataclass(frozen=True)
-class GridSettings:
-    """The regular grid of a lattice."""
-
-    max_edge_ratio: float = 1.4
-    """1: longest over shortest edge of a grid cell. Chosen because flatter hexahedra are too stiff
-    in bending."""
-    bottom_tolerance: float = 5e-5
-    """m: nodes this near to the plane of the flat bottom lie in it. Chosen because flat bottoms of
-    meshes vary by as much."""
-    max_cells: int = 1_000_000
-    """Largest number of cells of a grid over the bounding box. Chosen because a knee has as many at
-    0.35 mm, which take more than 50 GB."""
-    least_jacobian: float = 0.05
-    """1: a cell with a smaller scaled Jacobian is omitted. Chosen because its stiffness would be
-    ill-conditioned."""
-    least_edge: float = 0.2
-    """1: a cell with a shorter edge, relative to the smallest spacing, is omitted. Chosen because
-    its stiffness would be ill-conditioned."""
-
-
-GRID = GridSettings()
+# 1: longest over shortest edge of a grid cell. Chosen because flatter hexahedra are too stiff in
+# bending.
+MAX_EDGE_RATIO = 1.4
+# m: nodes this near to the plane of the flat bottom lie in it. Chosen because flat bottoms of
+# meshes vary by as much.
+BOTTOM_TOLERANCE = 5e-5
+# Largest number of cells of a grid over the bounding box. Chosen because a knee has as many at
+# 0.35 mm, which take more than 50 GB.
+MAX_CELLS = 1_000_000
+# 1: a cell with a smaller scaled Jacobian is omitted. Chosen because its stiffness would be ill-
+# conditioned.
+LEAST_JACOBIAN = 0.05
+# 1: a cell with a shorter edge, relative to the smallest spacing, is omitted. Chosen because its
+# stiffness would be ill-conditioned.
+LEAST_EDGE = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,7 +274,7 @@ def build_grid(insert: Surface, target_size: float) -> Lattice:
 
     Raises:
         InputError: the surface has too large holes, no cell fits into it, or there would be more
-            than `GRID.max_cells` cells.
+            than `MAX_CELLS` cells.
     """
     lattice = make_grid(insert, target_size)
     log_corrections(lattice, insert)
@@ -315,11 +299,11 @@ def make_grid(insert: Surface, target_size: float) -> Lattice:
     # This check comes before any array, because a mesh in millimetres would have 1e9 times as many
     # cells.
     count = float((extent / spacing).prod())
-    if count > GRID.max_cells:
+    if count > MAX_CELLS:
         raise InputError(
             f"{count:.2g} cells of {target_size / MILLIMETRE:g} mm are too many",
             insert.name,
-            f"give a larger resolution (at most {GRID.max_cells:.0e} cells), and check the unit "
+            f"give a larger resolution (at most {MAX_CELLS:.0e} cells), and check the unit "
             "of the mesh",
         )
     field = place_columns(insert, spacing)
@@ -337,7 +321,7 @@ def make_grid(insert: Surface, target_size: float) -> Lattice:
 def grid_spacing(extent: Array, target_size: float) -> Array:
     """Return the edges (3,), m, of cells that divide a box (3,) evenly.
 
-    The edges are near to the target size. If their ratio would exceed `GRID.max_edge_ratio`, the
+    The edges are near to the target size. If their ratio would exceed `MAX_EDGE_RATIO`, the
     nearest size with a smaller ratio is used.
     """
     if target_size <= 0.0:
@@ -348,7 +332,7 @@ def grid_spacing(extent: Array, target_size: float) -> Array:
     for percent in range(400):
         for size in (target_size / 1.01**percent, target_size * 1.01**percent):
             spacing = extent / np.maximum(np.round(extent / size), 1.0)
-            if spacing.max() / spacing.min() <= GRID.max_edge_ratio:
+            if spacing.max() / spacing.min() <= MAX_EDGE_RATIO:
                 return spacing
     raise InputError(
         f"a box of {np.round(extent / MILLIMETRE, 3)} mm cannot be divided into near-cubic cells"
@@ -364,8 +348,8 @@ def _sound_cells(field: NodeField, insert: Surface) -> tuple[Index, int]:
     total = len(cells)
     cells = cells[~_bridges_gap(field, cells)]
     points = field.points.reshape(-1, 3)
-    cells = cells[scaled_jacobians(points[cells]) > GRID.least_jacobian]
-    cells = cells[shortest_edges(points[cells]) > GRID.least_edge * field.spacing.min()]
+    cells = cells[scaled_jacobians(points[cells]) > LEAST_JACOBIAN]
+    cells = cells[shortest_edges(points[cells]) > LEAST_EDGE * field.spacing.min()]
     cells = cells[insert.winding.inside(points[cells].mean(axis=1))]
     cells = cells[standing_pieces(cells, _on_bottom(field))]
     return cells, total - len(cells)
@@ -420,7 +404,7 @@ def _classes(field: NodeField, cells: Index) -> NDArray[np.int8]:
 def _on_bottom(field: NodeField) -> Mask:
     """Return the mask, over the flattened grid, of nodes in the flat bottom."""
     height = field.points[..., 1].ravel()
-    flat = np.abs(height) <= max(GRID.bottom_tolerance, 0.02 * field.spacing[1])
+    flat = np.abs(height) <= max(BOTTOM_TOLERANCE, 0.02 * field.spacing[1])
     return field.lower_end.ravel() & flat
 
 

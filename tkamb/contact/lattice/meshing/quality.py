@@ -28,22 +28,15 @@ from tkamb.units import DEGREE, MILLIMETRE
 _log = logging.getLogger("tkamb")
 
 
-@dataclass(frozen=True)
-class VolumeSettings:
-    """Limits of the relative difference between the volumes of a lattice and its mesh."""
-
-    tolerance: float = 0.02
-    """1: largest difference. Chosen because stiffness and pressure of an insert of 8 mm change by
-    about as much."""
-    sizes: tuple[float, ...] = (1.0, 0.95, 0.9, 0.85, 0.8)
-    """1: cell sizes that are tried in turn, relative to the desired size. Chosen because the last
-    one gives twice as many cells."""
-    beyond_refinement: float = 0.1
-    """1: after a larger difference no smaller cells are tried. Chosen because a whole part is then
-    missing, not a thin rim."""
-
-
-VOLUME = VolumeSettings()
+# 1: largest difference. Chosen because stiffness and pressure of an insert of 8 mm change by about
+# as much.
+TOLERANCE = 0.02
+# 1: cell sizes that are tried in turn, relative to the desired size. Chosen because the last one
+# gives twice as many cells.
+SIZES = (1.0, 0.95, 0.9, 0.85, 0.8)
+# 1: after a larger difference no smaller cells are tried. Chosen because a whole part is then
+# missing, not a thin rim.
+BEYOND_REFINEMENT = 0.1
 
 
 def whole_lattice(insert: Surface, target_size: float) -> Lattice:
@@ -62,18 +55,18 @@ def whole_lattice(insert: Surface, target_size: float) -> Lattice:
             largest missing part.
     """
     first: tuple[Lattice, float] | None = None
-    for share in VOLUME.sizes:
+    for share in SIZES:
         lattice = make_grid(insert, share * target_size)
         error = volume_error(lattice.nodes, lattice.cells, insert)
         first = first or (lattice, error)
-        if abs(error) <= VOLUME.tolerance:
+        if abs(error) <= TOLERANCE:
             if share < 1.0:
                 words = _smaller_cells(target_size, share, first[1])
                 _log.warning("%s: %s", insert.name, words)
                 lattice = replace(lattice, size_notices=(words,))
             log_corrections(lattice, insert)
             return lattice
-        if abs(first[1]) > VOLUME.beyond_refinement:
+        if abs(first[1]) > BEYOND_REFINEMENT:
             break
     assert first is not None
     raise _volume_refusal(*first, insert, target_size)
@@ -97,7 +90,7 @@ def _volume_refusal(
     return InputError(
         f"the lattice of {target_size / MILLIMETRE:.3g} mm cells has {100 * abs(error):.1f} % "
         f"{'less' if error < 0 else 'more'} volume than the mesh, more than the "
-        f"{100 * VOLUME.tolerance:g} % that are allowed{lacks}",
+        f"{100 * TOLERANCE:g} % that are allowed{lacks}",
         insert.name,
         "take smaller cells; a lattice cannot have a part that does not stand on the bottom, or is "
         "thinner than a cell",

@@ -13,32 +13,30 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tkamb.contact.lattice.meshing.columns import COLUMN, NodeField, Nodes, refired, refired_inwards
+from tkamb.contact.lattice.meshing.columns import (
+    COLUMN_TIE,
+    NodeField,
+    Nodes,
+    refired,
+    refired_inwards,
+)
 from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.geometry.height_field import inside_intervals
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 
-
-@dataclass(frozen=True)
-class NotchSettings:
-    """Nodes that are moved into notches of the surface."""
-
-    corner_margin: float = 0.1
-    """1: a node is moved towards the line between its neighbours, except for this share of the way.
-    Chosen because on the line the cell's corner would be flat."""
-    corner_inset: float = 1e-3
-    """1: a node is moved to the corner of the part, and from there inwards by this share of the way
-    to the node across the diagonal. Chosen because vertical rays then meet the part."""
-    ray_start_cells: float = 0.1
-    """Cells: distance below the top, or above the bottom, of points that are tested for being
-    inside the part. Chosen above the rounding of a mesh and within the cell."""
-    max_move_diagonals: float = 0.75
-    """Diagonals of a cell's face: largest move of a node. Chosen because a larger move would invert
-    the cell."""
-
-
-NOTCH = NotchSettings()
+# 1: a node is moved towards the line between its neighbours, except for this share of the way.
+# Chosen because on the line the cell's corner would be flat.
+CORNER_MARGIN = 0.1
+# 1: a node is moved to the corner of the part, and from there inwards by this share of the way to
+# the node across the diagonal. Chosen because vertical rays then meet the part.
+CORNER_INSET = 1e-3
+# Cells: distance below the top, or above the bottom, of points that are tested for being inside
+# the part. Chosen above the rounding of a mesh and within the cell.
+RAY_START_CELLS = 0.1
+# Diagonals of a cell's face: largest move of a node. Chosen because a larger move would invert the
+# cell.
+MAX_MOVE_DIAGONALS = 0.75
 
 
 def fill_notches(field: NodeField, before: Array, rays: RayCaster) -> None:
@@ -105,20 +103,19 @@ def _fill(field: NodeField, notch: Notch, before: Array, rays: RayCaster) -> Non
         first[:, notch.axes[1]],
     )
     within = (
-        np.where(upper, -NOTCH.ray_start_cells, np.where(lower, NOTCH.ray_start_cells, 0.0))
-        * field.spacing[1]
+        np.where(upper, -RAY_START_CELLS, np.where(lower, RAY_START_CELLS, 0.0)) * field.spacing[1]
     )
-    corner = _towards(corner, across, NOTCH.corner_inset, 0.0)
+    corner = _towards(corner, across, CORNER_INSET, 0.0)
     winding = rays.surface.winding
     is_corner = winding.inside(_towards(corner, across, 0.0, within))
     usable = is_corner | winding.inside(_towards(middle, across, 0.1, within))
-    target = np.where(is_corner[:, None], corner, middle + NOTCH.corner_margin * (start - middle))
+    target = np.where(is_corner[:, None], corner, middle + CORNER_MARGIN * (start - middle))
     if flat:
         probe = np.where(is_corner[:, None], corner, middle)
         field.points[..., 1][notch.node] = middle[:, 1]
         field.upper_end[notch.node], field.lower_end[notch.node] = upper, lower
         target[:, 1] = refired(field, notch.node, probe, rays)
-    max_move = NOTCH.max_move_diagonals * np.linalg.norm(field.spacing[list(notch.axes)])
+    max_move = MAX_MOVE_DIAGONALS * np.linalg.norm(field.spacing[list(notch.axes)])
     usable &= np.linalg.norm((target - start)[:, notch.axes], axis=1) <= max_move
     _add_members(field, notch, target, usable, flat)
 
@@ -149,19 +146,12 @@ STEPS = ((0, 1), (0, -1), (2, 1), (2, -1))
 """Axis and sign of the four sideways directions."""
 
 
-@dataclass(frozen=True)
-class WallSettings:
-    """Nodes that are moved onto side walls."""
-
-    wall_inset: float = 1e-6
-    """1: distance inside the wall of a node that is moved to it, relative to the move. Chosen
-    because vertical rays then meet the part."""
-    ray_start_cells: float = 0.1
-    """Cells: distance inside the surface at which sideways rays of end nodes begin. Chosen above
-    the rounding of a mesh and within the cell."""
-
-
-WALL_NODE = WallSettings()
+# 1: distance inside the wall of a node that is moved to it, relative to the move. Chosen because
+# vertical rays then meet the part.
+WALL_INSET = 1e-6
+# Cells: distance inside the surface at which sideways rays of end nodes begin. Chosen above the
+# rounding of a mesh and within the cell.
+WALL_NODE_RAY_START_CELLS = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +185,7 @@ def _firing_points(field: NodeField) -> Array:
     height = field.points[..., 1]
     for end, step in ((field.upper_end, -1), (field.lower_end, 1)):
         i, j, k = np.nonzero(end & ~(field.upper_end & field.lower_end))
-        result[i, j, k, 1] += WALL_NODE.ray_start_cells * (height[i, j + step, k] - height[i, j, k])
+        result[i, j, k, 1] += WALL_NODE_RAY_START_CELLS * (height[i, j + step, k] - height[i, j, k])
     return result
 
 
@@ -255,7 +245,7 @@ def _move_out(field: NodeField, firing: Array, hits: list[WallHits], rays: RayCa
     for column, axis in ((0, 0), (1, 2)):
         forward, backward = hits[axis : axis + 2]
         ahead, behind = forward.distance, backward.distance
-        tie = COLUMN.tie * field.spacing[axis]
+        tie = COLUMN_TIE * field.spacing[axis]
         near = np.minimum(ahead, behind) <= 0.5 * field.spacing[axis] + tie
         is_ahead = ahead <= behind + tie
         step = np.where(is_ahead, ahead, -behind)
@@ -280,7 +270,7 @@ def _corner_or_wall(start: Array, move: Array, rays: RayCaster) -> Array:
     node moves to their corner if this lies in the part. Otherwise it moves to the foot of its
     perpendicular on the line through the two hits.
     """
-    move = move * (1.0 - WALL_NODE.wall_inset)
+    move = move * (1.0 - WALL_INSET)
     corner = start.copy()
     corner[:, [0, 2]] += move
     with_two_walls = np.flatnonzero((move != 0.0).all(axis=1))
@@ -301,7 +291,7 @@ def _pull_in(field: NodeField, before: Array, hits: list[WallHits], rays: RayCas
     height = np.full(field.member.shape, np.nan)
     for (axis, sign), hit in zip(STEPS, hits, strict=True):
         spacing = field.spacing[axis]
-        tie = COLUMN.tie * spacing
+        tie = COLUMN_TIE * spacing
         near = hit.open & (hit.distance < spacing + tie)
         i, j, k = np.nonzero(near)
         beside = [i, j, k]
@@ -357,7 +347,7 @@ def _foot(move: Array) -> Array:
 
     With two walls, a node moves to the foot of its perpendicular on the line through the hits.
     """
-    move = move * (1.0 + WALL_NODE.wall_inset)
+    move = move * (1.0 + WALL_INSET)
     with_two_walls = (move != 0.0).all(axis=1)
     result = move.copy()
     u, w = move[with_two_walls].T
