@@ -16,8 +16,7 @@ class CurvatureSettings:
     """Number of rays along the diameter of a patch. Chosen because about 350 rays for the six
     coefficients of a quadric average out the facets of a mesh."""
     max_iterations: int = 12
-    """Largest number of iterations for the contact point. Chosen because contacts of knees need
-    fewer."""
+    """Largest number of iterations for the contact point. Not studied."""
     position_tolerance: float = 1e-7
     """m: the contact point has converged when an iteration moves it by less. Chosen because it is
     far below the size of a triangle."""

@@ -59,11 +59,11 @@ class AdjustmentSettings:
     """m: difference of the condyles' gaps below which the femur is not turned. Chosen because
     meshes do not resolve smaller differences."""
     touch_difference: float = 1e-7
-    """m: difference of the condyles' travel to touch below which both touch together. Chosen
-    because forces do not change with smaller differences."""
+    """m: difference of the condyles' travel to touch below which both touch together.
+    Not studied."""
     max_turns: int = 20
     """Largest number of steps of the search for the turn at which both condyles touch together.
-    Chosen because the search needs fewer."""
+    Not studied."""
 
 
 ADJUSTMENT = AdjustmentSettings()

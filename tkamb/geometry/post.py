@@ -22,7 +22,7 @@ from tkamb.units import MILLIMETRE
 # m: smallest distance of the plane from a vertex. Chosen because it is above rounding.
 VERTEX_CLEARANCE = 1e-9
 # m: step by which the plane is moved until its distance from all vertices is at least
-# `VERTEX_CLEARANCE`. Chosen because it changes no result.
+# `VERTEX_CLEARANCE`. Not studied.
 PLANE_SHIFT = 1e-7
 
 

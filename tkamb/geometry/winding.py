@@ -34,8 +34,7 @@ if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
 
 
-# Largest number of buckets of the plan view. Larger: more memory. Chosen because a larger number
-# saves no time.
+# Largest number of buckets of the plan view. Larger: more memory. Not studied.
 MAX_BUCKETS = 1_000_000
 # Number of bits of the largest integer position. Chosen because products of differences fit into
 # 63 bits.

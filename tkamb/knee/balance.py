@@ -39,8 +39,7 @@ class BalanceSettings:
     the noise of the forces is larger, the noise replaces this tolerance. Chosen because it is far
     below the resolution of the reports."""
     step_tolerance: float = 2e-6
-    """m: Newton step below which a coordinate has converged. Chosen because such a step changes no
-    force by more than its tolerance."""
+    """m: Newton step below which a coordinate has converged. Not studied."""
     least_stiffness: float = 100.0
     """N/m: a state with a smaller stiffness is indeterminate. Chosen because such a state moves by
     more than 10 mm per newton."""

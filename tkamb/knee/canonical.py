@@ -38,10 +38,9 @@ from tkamb.knee.load import LinkPoint, PointForces, wrenches
 # m and rad: pose error below which the iteration has converged. Chosen because it is near the
 # rounding error of double precision.
 POSE_TOLERANCE = 1e-12
-# m and rad: largest pose error that is accepted after the last Newton step. Chosen because such an
-# error does not change a force noticeably.
+# m and rad: largest pose error that is accepted after the last Newton step. Not studied.
 ACCEPTED_POSE_ERROR = 1e-8
-# Maximum number of Newton steps. Chosen because a pose that converges needs fewer.
+# Maximum number of Newton steps. Not studied.
 MAX_POSE_STEPS = 30
 
 

@@ -50,10 +50,10 @@ class CouplingSettings:
     """m: largest travel of a centre of pressure in a converged iteration. A smaller travel
     does not change a force."""
     max_iterations: int = 20
-    """1: iterations after which a frame fails. Chosen because frames that converge need fewer."""
+    """1: iterations after which a frame fails. Not studied."""
     stiffness_error: float = 0.02
     """1: relative error of the knee's compliance to muscles above which a released frame gets a
-    flag. Chosen because the search converges with such an error."""
+    flag. Not studied."""
     post_overlap: float = 0.5 * MILLIMETRE
     """m: overlap of cam and post at a recorded pose above which a flag is set. Chosen because it is
     the usual error of a position from fluoroscopy."""

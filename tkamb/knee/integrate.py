@@ -30,7 +30,7 @@ VELOCITY_TOLERANCE = 1e-8
 # m/s and rad/s: residual below which the step is accepted if Newton's method no longer reduces it.
 # Chosen as a thousand times `VELOCITY_TOLERANCE`.
 STAGNATION_TOLERANCE = 1e-5
-# Maximum number of Newton steps. Chosen because a time step that converges needs fewer.
+# Maximum number of Newton steps. Not studied.
 MAX_NEWTON_STEPS = 40
 
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 # Number of sagittal sections across the band. A line wraps the convex outline of all sections.
-# Chosen because more sections hardly change the lines.
+# Not studied.
 SECTIONS = 7
 
 

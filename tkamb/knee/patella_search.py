@@ -38,17 +38,14 @@ class PatellaSearchSettings:
     """Tolerances and limits of the search for the patella."""
 
     length_tolerance: float = 1e-8
-    """m: error of gap and ligament length below which the search has converged. Chosen because such
-    an error does not change a force noticeably."""
+    """m: error of gap and ligament length below which the search has converged. Not studied."""
     rotation_tolerance: float = 1e-7
-    """rad: step of the rotation below which the search has converged. Chosen because such a step
-    does not change a force noticeably."""
+    """rad: step of the rotation below which the search has converged. Not studied."""
     max_chord_lengths: float = 8.0
     """1: largest extrapolation along the chord between the states at two rotations, in lengths of
     this chord. Chosen because a longer extrapolation fails."""
     max_evaluations: int = 14
-    """Maximum number of Newton steps from a guess near the solution. Chosen because searches that
-    converge need fewer."""
+    """Maximum number of Newton steps from a guess near the solution. Not studied."""
     lever_arm: float = 0.02
     """m: arm that makes a rotation comparable to a length in Broyden's update. Chosen as half the
     width of a patella."""

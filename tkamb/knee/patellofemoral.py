@@ -52,8 +52,7 @@ class PatellofemoralSettings:
     weight at this excess is exp(-14) = 8e-7: the gap of a patch of twenty samples jumps by 3e-11 m
     when a sample loses its weight."""
     coarse_samples: int = 60
-    """Number of samples of the quick check for touch. Chosen because an initial guess needs no
-    more."""
+    """Number of samples of the quick check for touch. Not studied."""
     lateral_compliance: float = 0.01
     """m: c of the module's equations, the shift under a purely lateral contact force. Chosen soft
     enough for a smooth search."""

@@ -75,7 +75,7 @@ class ReleasedKneeSettings:
     resolution of the reports."""
     initial_load_error: float = 0.5
     """1: largest relative difference between the load at a guess and the load of the last frame.
-    Chosen because the search converges from such a guess."""
+    Not studied."""
     max_height_steps: int = 4
     """Maximum number of heights that are tried to bring the load within `initial_load_error`.
     Chosen because each height costs one evaluation of the contact."""

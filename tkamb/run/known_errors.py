@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 STORED = Path(__file__).with_name("known_errors.json")
 
 
-# 1: relative error above which a known error is coloured. Chosen because such an error may change
-# a conclusion.
+# 1: relative error above which a known error is coloured. Not studied.
 NOTABLE_SHARE = 0.10
 # Smallest number of pairs of bodies behind a stated error. Measured: in subsets of three, the
 # largest error had to be doubled to cover 95 % of the others.

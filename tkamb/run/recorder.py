@@ -209,7 +209,7 @@ MAPS = ("pressure", "gap", "nodal_force", "pose", *CONTACT_PLACES)
 # s: least time before the first and between later copies of the results. Chosen so that the
 # results of a killed run lack few frames.
 SHORTEST_PAUSE_SECONDS = 1.0
-# 1: largest share of the computing time for these copies. Chosen because it is not noticeable.
+# 1: largest share of the computing time for these copies. Not studied.
 LARGEST_TIME_SHARE = 0.02
 
 

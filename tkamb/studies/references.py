@@ -44,8 +44,7 @@ from tkamb.studies.measures import (
 )
 from tkamb.units import MILLIMETRE
 
-# Rings of constant pressure under the sphere. Chosen because twice as many have no effect on the
-# comparisons.
+# Rings of constant pressure under the sphere. Not studied.
 RINGS = 160
 # Wave number times thickness above which the layer is treated as a half-space. Chosen because the
 # difference is below round-off.

@@ -180,10 +180,10 @@ def unit(vectors: Array) -> Array:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
-# Largest number of Newton steps. Chosen because strings that converge need fewer.
+# Largest number of Newton steps. Not studied.
 MAX_ITERATIONS = 30
 # rad: the iteration has converged if the error of the string's direction at its end is smaller.
-# Chosen because the touching points then do not change noticeably.
+# Not studied.
 TOLERANCE = 1e-11
 # rad: a geodesic that ends beyond its touching point is shortened if its direction error is
 # smaller than this. Chosen because the derivative may have the wrong sign at larger errors.

@@ -39,7 +39,7 @@ from tkamb.io.opensim.model import WrapObject
 # Number of angles on a torus's ring at which the string is tried. Chosen as one every 7.5 deg.
 RING_PLACES = 48
 # Gap between a shrunken ellipsoid and the point inside the original one, as a share of the
-# ellipsoid's size. Chosen because it exceeds rounding and hardly changes a muscle's length.
+# ellipsoid's size. Not studied.
 ELLIPSOID_CLEARANCE = 1e-3
 
 
@@ -240,14 +240,13 @@ def _ellipsoid(
     return WrapTouch(touches, entry, leave, arc, push)
 
 
-# Largest number of sweeps over all objects. A string that needs more fails. Chosen because strings
-# that converge need fewer.
+# Largest number of sweeps over all objects. A string that needs more fails. Not studied.
 MAX_SWEEPS = 100
 # Largest extrapolation, as a multiple of the last step. Chosen because two sweeps do not support a
 # larger one.
 MAX_EXTRAPOLATION = 10.0
-# m: a string has converged if a sweep changes no coordinate of a touching point by more. Chosen
-# because such a change does not matter to a muscle's length.
+# m: a string has converged if a sweep changes no coordinate of a touching point by more.
+# Not studied.
 TOLERANCE = 1e-10
 
 

@@ -30,7 +30,7 @@ STEP_TOLERANCE = 1e-6
 # otherwise it does not (Gauss-Newton). Chosen because Newton's method converges near the solution
 # only.
 NEWTON_BELOW = 0.1
-# Largest number of iterations of a frame. Chosen because frames that converge need fewer.
+# Largest number of iterations of a frame. Not studied.
 MAX_ITERATIONS = 60
 
 

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 
-# Number of samples on either side for the median deviation. Chosen because they are enough for a
-# median, and few enough to follow a movement.
+# Number of samples on either side for the median deviation. Not studied.
 NEIGHBOURS = 12
 # 1: smallest ratio of an odd sample's deviation to the median. Chosen because normal noise exceeds
 # it once in 10 million samples.

@@ -37,7 +37,7 @@ class SharedMuscleSettings:
     rounding of the two files is smaller."""
     max_iterations: int = 8
     """1: largest number of iterations, each with muscle forces for the condyles lifted so far. A
-    frame that needs more fails. Chosen because frames that converge need fewer."""
+    frame that needs more fails. Not studied."""
 
 
 SHARED_MUSCLES = SharedMuscleSettings()

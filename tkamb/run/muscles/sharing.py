@@ -38,11 +38,10 @@ class StaticOptimisationSettings:
     """Stopping criteria of the static optimisation of a frame."""
 
     newton_tolerance: float = 1e-10
-    """1: change of the activations below which the sequence for p > 2 has converged. Chosen because
-    it is too small to change a force."""
+    """1: change of the activations below which the sequence for p > 2 has converged.
+    Not studied."""
     most_steps: int = 60
-    """1: largest number of quadratic programmes for p > 2. Chosen because sequences that converge
-    need fewer."""
+    """1: largest number of quadratic programmes for p > 2. Not studied."""
     solver_tolerance: float = 1e-11
     """1: primal and dual tolerance of DAQP. Chosen for rows that are scaled to about 1."""
 

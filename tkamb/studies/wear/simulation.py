@@ -43,7 +43,7 @@ class WearSimulationSettings:
     do not describe the cycle."""
     min_improvement: float = 1.1
     """Factor by which a halving must reduce the share that moves to other points. Otherwise the
-    block is not halved again. Chosen because further halvings then have no effect."""
+    block is not halved again. Not studied."""
 
 
 WEAR_SIMULATION = WearSimulationSettings()
