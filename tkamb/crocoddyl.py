@@ -12,8 +12,8 @@ By the implicit function theorem, with J0 and J1 of `pin.dIntegrate`,
 
 `CondyleForces` and `CondylePressures` are residuals for costs on the contact. If the model is
 out of its range, or Newton's method does not converge, the next state is NaN: the solver then
-shortens its step. The models are Python objects: set `nthreads = 1` in a `ShootingProblem`, because
-a second thread of Crocoddyl ends the process. Crocoddyl must fit the installed Pinocchio
+shortens its step. The models are Python objects: set `nthreads = 1` in a `ShootingProblem`:
+more threads were not tested. Crocoddyl must fit the installed Pinocchio
 (`tkamb.crocoddyl_pair`).
 
 Reference: Mastalli et al., Crocoddyl: an efficient and versatile framework for multi-contact
