@@ -8,6 +8,7 @@ another frame. A mesh that is read with a warning or an error is read again each
 import hashlib
 import inspect
 import logging
+import os
 from collections import OrderedDict
 from contextlib import contextmanager
 from pathlib import Path
@@ -53,7 +54,7 @@ def _loading(load, store):
 
     def shared(path, *arguments, **named):
         given = options.bind(path, *arguments, **named).arguments
-        if not Path(path).is_file():
+        if not os.path.isfile(path):  # a name may be too long
             return load(path, *arguments, **named)
         content = hashlib.sha256(Path(path).read_bytes()).hexdigest()
         key = (content, Path(path).suffix, *(repr(v) for k, v in given.items() if k != "path"))
