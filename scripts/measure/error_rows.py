@@ -48,7 +48,7 @@ SETTINGS: dict[str, dict[str, tuple[float, ...]]] = {
     },
 }
 """Material -> contact model -> measured resolutions, mm."""
-RATIOS = Path(__file__).parent / "data" / "known_error_ratios.json"
+RATIOS = Path(__file__).parents[1] / "data" / "known_error_ratios.json"
 """Result of `ratios`."""
 COMPARED = ("approach", "mean_pressure", "peak_pressure", "area")
 
