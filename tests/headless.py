@@ -72,6 +72,11 @@ class Page:
             self._page.click(selector)
         return Path(download.value.path()).read_bytes()
 
+    def resize(self, width, height):
+        """Set the size of the window, px, and wait until the page has drawn it."""
+        self._page.set_viewport_size({"width": width, "height": height})
+        self.evaluate("new Promise((done) => requestAnimationFrame(() => setTimeout(done, 50)))")
+
     def press(self, key):
         """Press a key. The focused element receives it."""
         self._page.keyboard.press(key)

@@ -91,6 +91,11 @@ def test_the_error_of_a_shipped_scene_has_the_sign_that_was_measured(path, shipp
     else:
         (direction,) = {"too high" if t.bias_BW > 0 else "too low" for t in measured if t.bias_BW}
         assert {*re.findall("too high|too low", every)} == {direction}
+        computed = [f"{t.peak_BW:.2f}" for t in measured]
+        peaks = [f"{t.measured_peak_BW:.2f}" for t in measured]
+        how_wrong = dict(lead(run, horizontal_axis(run)))["How wrong they may be"]
+        for numbers in (computed, peaks):
+            assert f" {' and '.join(numbers)} BW" in how_wrong
 
 
 MUSCLES = {

@@ -3,6 +3,8 @@
 import json
 import shutil
 import zipfile
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,9 +14,12 @@ from scenes import write_scene
 from tkamb import files
 from tkamb.cli import main
 from tkamb.errors import InputError
+from tkamb.io.scene import load_scene
+from tkamb.run.identity import input_hashes
 from tkamb.run.recorder import Shard, Shards
 from tkamb.run.results_folder import read_results, write_results
-from tkamb.show.comparison import compare_folders
+from tkamb.show.comparison import SAME, compare_folders
+from tkamb.show.comparison_page import comparison_html, table_lines
 
 
 @pytest.fixture(scope="module")
@@ -266,13 +271,74 @@ def test_a_copy_in_another_folder_is_the_same_run_and_a_changed_byte_is_named(
     for key in ("scene_sha256", "inputs", "scene_tables"):
         assert first[key] == second[key]
     comparison = compare_folders([finished / "out", other / "out"])
-    assert not comparison.notes
+    assert not comparison.notes and not any(one.max_abs for one in comparison.differences)
+    assert f"note: {SAME}" in table_lines(comparison) and SAME in comparison_html(comparison)
     ground = other / "scene" / "ground_reaction.csv"
     ground.write_text(ground.read_text() + "\n")
     assert main([*again, "--frames", "0:9:4"]) == 0
     assert read_results(other / "out").summary["scene_sha256"] != first["scene_sha256"]
     (note,) = compare_folders([finished / "out", other / "out"]).notes
     assert "input file ground_reaction.csv" in note
+
+
+INPUTS = {
+    "scene": "own.toml",
+    "base": "scene.toml",
+    "urdf": "patient.urdf",
+    "motion": "motion.csv",
+    "shank": "tibia.csv",
+    "plate": "ground_reaction.csv",
+    "mesh": "insert.stl",
+    "muscles": "leg.osim",
+    "file of the muscles' model": "wraps.xml",
+    "emg": "emg.csv",
+    "measured forces": "forces.csv",
+}
+"""Kind of an input -> its file."""
+
+
+@pytest.fixture(scope="module")
+def every_kind(tmp_path_factory):
+    """Return a scene with an input of each kind. Only their bytes matter."""
+    folder = tmp_path_factory.mktemp("kinds")
+    base = write_scene(folder)
+    (folder / "leg.osim").write_text('<OpenSimDocument file="wraps.xml"/>')
+    for name in ("wraps.xml", "emg.csv", "forces.csv"):
+        (folder / name).write_text(name)
+    scene = folder / "own.toml"
+    scene.write_text(
+        f'base = "{base.name}"\n[muscles]\nmodel = "leg.osim"\n'
+        '[muscles.emg]\nfile = "emg.csv"\nhigh_pass_Hz = "none"\ncutoff_Hz = 6\n'
+        'channels = { VL = ["vaslat"] }\n'
+        '[measured]\nfile = "forces.csv"\nunit = "N"\noffset_s = 0\ncolumns = { total = "all" }\n'
+    )
+    return scene
+
+
+def hashes(scene):
+    """Return the hashes of a scene's inputs, of which all files are read."""
+    return input_hashes(SimpleNamespace(scene=load_scene(scene), femoral=True), scene)
+
+
+@pytest.mark.parametrize("kind", INPUTS)
+def test_compare_names_the_input_of_which_one_byte_differs(finished, every_kind, monkeypatch, kind):
+    path = every_kind.parent / INPUTS[kind]
+    content, before = path.read_bytes(), hashes(every_kind)
+    try:
+        path.write_bytes(
+            bytes([content[0] ^ 1]) + content[1:] if kind == "mesh" else content + b" "
+        )
+        after = hashes(every_kind)
+    finally:
+        path.write_bytes(content)
+    stored = read_results(finished / "out", check=False)
+    runs = {
+        name: replace(stored, summary=stored.summary | {"inputs": inputs})
+        for name, inputs in (("a", before), ("b", after))
+    }
+    monkeypatch.setattr("tkamb.show.comparison.read_results", lambda path: runs[path.name])
+    (note,) = compare_folders(["a", "b"]).notes
+    assert f"differ in the input file {INPUTS[kind]}. " in note
 
 
 def test_compare_names_the_setting_and_the_version_that_differ(run, tmp_path):

@@ -289,3 +289,13 @@ def test_the_lattice_is_drawn_when_its_layer_is_switched_on(live, show):
 def test_results_can_be_viewed_in_a_notebook(folder):
     text = tkamb.view(read_results(folder), frame=1)._repr_html_()
     assert text.startswith("<iframe srcdoc=") and "&lt;script" in text
+
+
+def test_on_a_narrow_screen_the_panel_is_below_the_knee(browser):
+    browser.resize(390, 844)
+    box = "document.querySelector('{}').getBoundingClientRect()"
+    knee, panel = (browser.evaluate(box.format(one)) for one in ("#pane canvas", "#side"))
+    page = browser.evaluate("document.documentElement.scrollWidth")
+    browser.resize(1400, 900)
+    assert page == knee["width"] == panel["width"] == 390
+    assert 0.4 * 844 < knee["bottom"] <= panel["top"] + 1 and panel["bottom"] == 844

@@ -195,6 +195,12 @@ class MethodError:
         return float(np.sqrt(np.mean(squares)))
 
     @property
+    def peak_error(self) -> float:
+        """Largest difference between the computed and the measured peak, with its sign, BW."""
+        errors = [one.peak_BW - one.measured_peak_BW for one in self.trials]
+        return max(errors, key=abs)
+
+    @property
     def sentences(self) -> list[str]:
         """Sentences on the errors, first on an activity without a measurement."""
         return texts.lines("tkamb.run", "error.txt", error=self, groups=self.groups)

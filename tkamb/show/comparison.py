@@ -116,6 +116,7 @@ SETTINGS = {
 }
 """Keys of summary.json that are reported where they differ."""
 VERSIONS = "identity"
+SAME = "Nothing differs: settings, input files, versions and code of the runs agree."
 
 
 @dataclass(frozen=True)
@@ -347,13 +348,13 @@ def _flat(value: Any, name: str = "") -> dict[str, Any]:
 def _unlike_inputs(runs: Sequence[Run]) -> list[str]:
     """Return a sentence for each input file whose content differs.
 
-    Scene files have sentences on their keys. A file that only some runs read is in a setting.
+    A file that only some runs read is in a setting.
     """
     inputs = [run.results.summary.get("inputs") or {} for run in runs]
     return [
         note
         for name in dict.fromkeys(name for one in inputs for name in one)
-        if all(name in one for one in inputs) and not name.endswith(".toml")
+        if all(name in one for one in inputs)
         for note in _unlike(runs, f"the input file {name}", [one[name] for one in inputs])
     ]
 

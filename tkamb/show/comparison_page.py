@@ -16,7 +16,7 @@ from tkamb.run import metrics
 from tkamb.run.claims import split_of
 from tkamb.run.metrics import failed, map_rows, medial_share, residual_share, tension_ratio
 from tkamb.show.axis import UNITS
-from tkamb.show.comparison import Comparison, Difference, Run
+from tkamb.show.comparison import SAME, Comparison, Difference, Run
 from tkamb.show.headline import limits_line, peak_lines
 from tkamb.show.pages import asset, policy_sources, render
 from tkamb.show.pressure_maps import draw_map, pressure_bar, top_view
@@ -263,7 +263,7 @@ def comparison_html(comparison: Comparison, frame: int | None = None) -> str:
         kind=comparison.kind,
         runs=[_run(comparison, number) for number in range(len(comparison.runs))],
         peaks=run_lines(comparison),
-        notes=comparison.notes,
+        notes=comparison.notes or (SAME,),
         plots=_plots(comparison),
         maps=None if maps is None else svg_text(maps, "maps"),
         first=_rows(comparison, first),
@@ -335,5 +335,5 @@ def table_lines(comparison: Comparison) -> list[str]:
     table = ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) for row in rows]
     if len(rows) == 1:
         table = ["no differences could be computed"]
-    notes = [f"note: {note}" for note in comparison.notes]
+    notes = [f"note: {note}" for note in comparison.notes or (SAME,)]
     return [*run_lines(comparison), *notes, *(line.rstrip() for line in table)]

@@ -269,7 +269,10 @@ function newViewer(pane, smooth) {
     };
   }
   try {
-    return new MeshCat.Viewer(pane);
+    const viewer = new MeshCat.Viewer(pane), sized = viewer.set_3d_pane_size;
+    // MeshCat takes the height of the window, but on a narrow screen the panel is below the pane.
+    viewer.set_3d_pane_size = () => sized.call(viewer, pane.offsetWidth, pane.offsetHeight);
+    return viewer;
   } finally {
     prototype.getContext = usual;
   }
