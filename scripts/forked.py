@@ -16,7 +16,7 @@ from typing import Any
 NEEDED = (
     "tkamb.cli",
     "tkamb.run.simulation",
-    "tkamb.run.contact_side",
+    "tkamb.run.recording",
     "tkamb.run.maps",
     "tkamb.contact.lattice.model",
     "tkamb.contact.foundation",

@@ -21,7 +21,7 @@ from tkamb.errors import TkambError
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.run.plausibility.plausibility import Plausibility
-from tkamb.run.read_scene import mechanics_of
+from tkamb.run.read_scene import recording_of
 from tkamb.run.status import frame_status
 
 DM = MODEL.parent / "dm"
@@ -114,17 +114,17 @@ class Bench:
         if contact is not None:  # contact is not computed, but its settings are checked
             contact_model(contact.model, resolution=contact.resolution_mm * 1e-3, **contact.options)
             material(contact.material)
-        mechanics = mechanics_of(case)
-        plausibility = Plausibility(case, mechanics)
+        recording = recording_of(case)
+        plausibility = Plausibility(case, recording)
         words = {NUMBER.sub("#", question.text) for question in plausibility.questions}
         forces = []
         for k in self.frames:
-            body = mechanics.frame(k)
-            status = frame_status(case, k, body, None, plausibility.flags(k, body))
+            frame = recording.loads(k)
+            status = frame_status(case, k, frame, plausibility.flags(k, frame))
             flags = [] if status == "ok" else status.split("; ")
             words |= {f"{k}: {NUMBER.sub('#', word)}" for word in flags}
-            values = {**body.loads.values, **body.geometry.tensions}
-            forces += [*body.loads.contact_force, *(values[name] for name in sorted(values))]
+            values = {**frame.loads.values, **frame.geometry.tensions}
+            forces += [*frame.loads.contact_force, *(values[name] for name in sorted(values))]
         return Outcome("", frozenset(words), np.array(forces))
 
 

@@ -6,7 +6,7 @@ import pytest
 from scenes import write_scene
 from tkamb import load_scene, simulate
 from tkamb.io.scene.case import load_case
-from tkamb.run.read_scene import contact_side, mechanics_of
+from tkamb.run.read_scene import recording_of
 
 FRAMES = slice(3, 26, 10)
 
@@ -80,15 +80,15 @@ def test_a_restored_frame_has_its_contact_points_at_the_recorded_rotation(tmp_pa
     path = wrong_scene(tmp_path, 0.3, 0.0)
     changes = {"contact.adjust": True, "contact.adjust_restore_when": "either"}
     case = load_case(load_scene(path, changes | {"motion.frames": 26}))
-    side = contact_side(case, mechanics_of(case))
+    recording = recording_of(case)
     restored = 0
     for k in (12, 23):
-        body, contact = side.frame(k)
-        if not contact.adjustment.restored:
+        frame = recording.frame(k)
+        if not frame.adjustment.restored:
             continue
         restored += 1
-        closest = side.mechanics.query.at(contact.adjustment.pose)
-        for name, point in body.geometry.condyles.items():
+        closest = recording.knee._query.at(frame.adjustment.pose)
+        for name, point in frame.geometry.condyles.items():
             np.testing.assert_array_equal(point.point, getattr(closest, name).centre)
-        np.testing.assert_array_equal(contact.result.pose[:3, :3], side.mechanics.poses[k][:3, :3])
+        np.testing.assert_array_equal(frame.contact.pose[:3, :3], recording.poses[k][:3, :3])
     assert restored

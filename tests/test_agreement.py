@@ -17,7 +17,7 @@ from tkamb.geometry.frames import KNEE_COORDINATES, knee_pose
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.knee.adjustment import split_sensitivity, split_tangent
-from tkamb.run.read_scene import contact_side, mechanics_of
+from tkamb.run.read_scene import recording_of
 from tkamb.run.status import contradictions
 from tkamb.show.axis import horizontal_axis
 from tkamb.show.headline import cards
@@ -41,12 +41,12 @@ def shipped(tmp_path_factory):
 
 def test_split_sensitivities_by_tangent_and_by_presses_agree_on_the_shipped_knee(tmp_path):
     case = load_case(load_scene(write_scene(tmp_path)))
-    side = contact_side(case, mechanics_of(case))
+    recording = recording_of(case)
     for k in (10, 60, 95):
-        _, contact = side.frame(k)
-        turned = split_sensitivity(Probe(side.model, side.state), contact.result)
-        assert contact.sensitivity == pytest.approx(turned, rel=0.03)
-        assert contact.sensitivity != turned
+        frame, contact = recording.frame(k), recording.knee.contact
+        turned = split_sensitivity(Probe(contact.model, contact.state), frame.contact)
+        assert frame.sensitivity == pytest.approx(turned, rel=0.03)
+        assert frame.sensitivity != turned
 
 
 @pytest.mark.parametrize("name", ["foundation-linear", "lattice-linear"])
@@ -99,16 +99,16 @@ def test_a_probe_of_a_failed_result_evaluates_all_columns():
 def test_sensitivity_is_the_difference_quotient_of_presses(tmp_path):
     """Presses at ±0.05 deg of adduction, with the load of the equations of motion."""
     case = load_case(load_scene(write_scene(tmp_path)))
-    side = contact_side(case, mechanics_of(case))
-    body, contact = side.frame(60)
+    recording = recording_of(case)
+    frame, contact = recording.frame(60), recording.knee.contact
     medial = []
     for angle in np.radians([-0.05, 0.05]):
         place = case.motion.coordinates[60].copy()
         place[KNEE_COORDINATES.index("adduction")] += angle
-        load = float(body.loads.contact_force[1])
-        medial.append(side.model.press(side.state, load, knee_pose(place)).medial.force)
+        load = float(frame.loads.contact_force[1])
+        medial.append(contact.model.press(contact.state, load, knee_pose(place)).medial.force)
     slope = np.diff(medial)[0] / np.radians(0.1)
-    assert contact.sensitivity == pytest.approx(slope, rel=0.03)
+    assert frame.sensitivity == pytest.approx(slope, rel=0.03)
     assert slope > 0  # a varus rotation loads the medial condyle
 
 
@@ -163,13 +163,13 @@ def test_an_axial_rotation_of_the_wrong_sign_is_flagged(tmp_path, shipped):
 def dm_side():
     changes = {"contact.model": "foundation", "contact.resolution_mm": 2.0}
     case = load_case(load_scene(DM, changes))
-    return case, contact_side(case, mechanics_of(case))
+    return case, recording_of(case)
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="needs subject DM's files beside the project")
 @pytest.mark.parametrize("k", [27, 28, 29, 30, 31, 69, 86, 90, 94])
 def test_contradictory_frames_of_dm_are_flagged(k):
-    case, side = dm_side()
-    words = contradictions(case, *side.frame(k))
+    case, recording = dm_side()
+    words = contradictions(case, recording.frame(k))
     assert any("by deformation contradicts" in word for word in words)
     assert any("carries nothing by deformation" in word for word in words)

@@ -12,7 +12,7 @@ from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.frames import knee_pose
 from tkamb.io.scene.case import load_case
 from tkamb.knee.chain import Chain
-from tkamb.run.read_scene import mechanics_of
+from tkamb.run.read_scene import recording_of
 from tkamb.run.tabulate import WHY_IT_FAILED
 from tkamb.show.sections import strain_table
 
@@ -136,10 +136,10 @@ def test_a_wider_quadriceps_band_wraps_earlier_and_over_a_larger_angle():
     """The ridges beside the groove are in front of its floor."""
     wraps = []
     for band in (5.0, 12.0):
-        mechanics = mechanics_of(
+        recording = recording_of(
             load_case(load_scene(fast_scene(), FEW | {"quadriceps.band_mm": band}))
         )
-        wraps.append([mechanics.geometry(k).extensor.wrap for k in (12, 19, 25)])
+        wraps.append([recording.geometry(k).extensor.wrap for k in (12, 19, 25)])
     assert wraps[0][0] == 0.0
     assert (np.array(wraps[1]) > np.array(wraps[0])).all()
 
@@ -154,10 +154,10 @@ def test_a_long_motion_stores_no_chain_state_per_frame(monkeypatch):
         return state
 
     monkeypatch.setattr(Chain, "at", recorded_at)
-    mechanics = mechanics_of(load_case(load_scene(fast_scene(), FEW)))
-    assert mechanics.ligaments
-    for k in range(len(mechanics.motion)):
-        mechanics.geometry(k)
+    recording = recording_of(load_case(load_scene(fast_scene(), FEW)))
+    assert recording.ligaments
+    for k in range(len(recording.motion)):
+        recording.geometry(k)
     assert len(states) >= 26
     assert sum(state_reference() is not None for state_reference in states) <= 1
 

@@ -17,20 +17,20 @@ from tkamb.knee.contact_points import CondylePoint
 from tkamb.knee.equations import EQUATION, solve_knee
 from tkamb.knee.ligament_laws import QuadraticToe, TwoLine
 from tkamb.knee.unknowns import residuals
-from tkamb.run.read_scene import mechanics_of
+from tkamb.run.read_scene import recording_of
 
 FRICTION = 0.05
 ROWS = slice(30, 91, 30)
 
 
 @pytest.fixture(scope="module")
-def mechanics():
-    return mechanics_of(load_case(load_scene(MODEL / "scene.toml")))
+def recording():
+    return recording_of(load_case(load_scene(MODEL / "scene.toml")))
 
 
 @pytest.fixture(scope="module")
-def frame(mechanics):
-    return mechanics.frame(60)
+def frame(recording):
+    return recording.loads(60)
 
 
 @pytest.fixture(scope="module")
@@ -160,9 +160,9 @@ def test_friction_opposes_the_sliding_of_the_femur():
     np.testing.assert_allclose(still, up)
 
 
-def test_sliding_is_the_femur_s_velocity_at_the_contact(mechanics, frame):
+def test_sliding_is_the_femur_s_velocity_at_the_contact(recording, frame):
     """Central differences of the recorded poses give the velocity in the insert frame."""
-    time, poses = mechanics.motion.time, mechanics.poses
+    time, poses = recording.motion.time, recording.poses
     for condyle in frame.geometry.condyles.values():
         on_femur = np.linalg.inv(poses[60]) @ np.append(condyle.point, 1.0)
         moved = [(poses[k] @ on_femur)[:3] for k in (59, 61)]

@@ -1,5 +1,6 @@
 """Cam and post: a second contact pair besides the condyles, in a turned frame."""
 
+import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.knee.load import total_wrench, wrench_of
 from tkamb.knee.released_forces import external_wrench
-from tkamb.run.read_scene import contact_side, mechanics_of
+from tkamb.run.read_scene import recording_of
 from tkamb.run.tabulate import frame_row
 from tkamb.studies.designs.design import CAM_MESH, INSERT_MESH, load_design
 from tkamb.units import MILLIMETRE
@@ -238,9 +239,7 @@ def test_power_is_the_same_in_both_frames():
 
 @pytest.fixture(scope="module")
 def knee(tmp_path_factory):
-    """Return a function from released coordinates to the contact side of the shipped bend with a
-    cam.
-    """
+    """Return a function from released coordinates to the shipped bend with a cam."""
     folder = tmp_path_factory.mktemp("bend")
     DESIGN.write_meshes(folder / "ps")
     changes = {
@@ -251,27 +250,27 @@ def knee(tmp_path_factory):
     }
     drop = ("quadriceps", "patellar_ligament", "patella")
     case = load_case(load_scene(write_scene(folder / "knee", drop, **changes)))
-    side = contact_side(case, mechanics_of(case))
+    recording = recording_of(case)
 
     def released(*names):
-        contact = case.scene.contact.model_copy(update={"released": names})
-        other = replace(case, scene=case.scene.model_copy(update={"contact": contact}))
-        return contact_side(other, side.mechanics, post=side.post)
+        other = copy.copy(recording)
+        other.method = replace(recording.method, released=names, ready_cam=recording.method.cam)
+        return other
 
     released.case = case
     return released
 
 
-@pytest.mark.parametrize(("released", "frame"), [((), 58), (("ap", "adduction"), 80)])
-def test_condyles_and_post_together_balance_the_shank(knee, released, frame):
+@pytest.mark.parametrize(("released", "k"), [((), 58), (("ap", "adduction"), 80)])
+def test_condyles_and_post_together_balance_the_shank(knee, released, k):
     """The wrenches of ground, weight, inertia, ligaments, condyles, post and residuals add up to
     zero.
     """
-    side = knee(*released)
-    body, contact = side.frame(frame)
-    geometry, values, friction = body.geometry, body.loads.values, side.mechanics.friction
-    assert not body.loads.problems
-    assert contact.post.force[0] > 100
+    recording = knee(*released)
+    frame = recording.frame(k)
+    geometry, values, friction = frame.geometry, frame.loads.values, recording.knee.friction
+    assert not frame.loads.problems
+    assert frame.post.force[0] > 100
     tibia, femur = geometry.post
     middle = np.array([0.01, 0.02, 0.03])
     assert total_wrench([tibia], middle) == pytest.approx(-total_wrench([femur], middle))
@@ -287,31 +286,31 @@ def test_condyles_and_post_together_balance_the_shank(knee, released, frame):
     total = total + wrench_of(at, remaining) + np.append(np.zeros(3), moment)
     assert total == pytest.approx(np.zeros(6), abs=1e-6)
     if not released:
-        pressed = -contact.result.wrench_on_insert[1]
-        assert pressed == pytest.approx(body.loads.contact_force[1], rel=1e-3)
+        pressed = -frame.contact.wrench_on_insert[1]
+        assert pressed == pytest.approx(frame.loads.contact_force[1], rel=1e-3)
         return
     assert abs(values["residual_ap"]) < 0.1
-    assert contact.result.medial.force == pytest.approx(values["medial_normal"], rel=2e-3)
-    assert contact.result.lateral.force == pytest.approx(values["lateral_normal"], rel=2e-3)
+    assert frame.contact.medial.force == pytest.approx(values["medial_normal"], rel=2e-3)
+    assert frame.contact.lateral.force == pytest.approx(values["lateral_normal"], rel=2e-3)
 
 
 def test_without_friction_the_equations_get_the_wrench_of_the_pair(knee):
-    side = knee()
-    load = side.post.at(place(95.0, -6.2, 2.0)).load
-    smooth = replace(side.mechanics.instant(58), friction=0.0)
+    recording = knee()
+    load = recording.method.cam.at(place(95.0, -6.2, 2.0)).load
+    smooth = replace(recording.instant(58), friction=0.0)
     push, _ = smooth.post_loads(smooth.coordinates, load)
     assert total_wrench([push], np.zeros(3)) == pytest.approx(load.wrench, abs=1e-9)
 
 
 def test_a_recorded_overlap_is_flagged_and_a_deep_one_fails(knee):
-    contact = knee().frame(59)[1]
-    assert contact.post.gap < -0.5e-3
-    assert any("add 'ap' to [contact] released" in flag for flag in contact.post.flags)
-    body, contact = knee().frame(70)
-    assert contact.result is None
-    assert "cam-post contact out of range" in contact.problem
-    assert np.isnan(body.loads.contact_force).all()
-    row = frame_row(knee.case, 70, body, contact, {}, "failed")
+    frame = knee().frame(59)
+    assert frame.post.gap < -0.5e-3
+    assert any("add 'ap' to [contact] released" in flag for flag in frame.post.flags)
+    frame = knee().frame(70)
+    assert frame.contact is None
+    assert "cam-post contact out of range" in frame.problem
+    assert np.isnan(frame.loads.contact_force).all()
+    row = frame_row(knee.case, 70, frame, {}, "failed")
     assert np.isnan([row["post_force_N"], row["post_area_mm2"], row["force_si_N"]]).all()
 
 

@@ -100,7 +100,7 @@ def test_notices_on_every_recording_reach_check_run_summary_and_report(tmp_path,
     result = check_scene(scene)
     assert sorted(result.as_dict()["notices"]) == sorted(expected)
     assert all(f"notice: {notice}" in result.lines() for notice in expected)
-    figure = draw_leg(result.case, result.mechanics)
+    figure = draw_leg(result.case, result.recording)
     assert all(notice.replace("'", "&#39;") in check_html(result, figure) for notice in expected)
     out = tmp_path / "out"
     run = [
@@ -121,7 +121,7 @@ def test_notices_on_every_recording_reach_check_run_summary_and_report(tmp_path,
 def test_the_drawn_leg_agrees_with_the_chain_and_the_force_plate(checked):
     """Segments keep their lengths, the hip is above the ankle, the force acts on the plate."""
     case = checked.case
-    frames = [leg_frame(case, checked.mechanics, k) for k in shown_frames(case)]
+    frames = [leg_frame(case, checked.recording, k) for k in shown_frames(case)]
     assert len(frames) == 3
     shank = [np.linalg.norm(one.joints[1] - one.joints[2]) for one in frames]
     np.testing.assert_allclose(shank, shank[0], rtol=1e-12)
@@ -161,7 +161,7 @@ def test_the_page_has_the_files_and_the_picture(checked):
 def test_the_mcl_is_drawn_on_the_side_labelled_medial(side, tmp_path):
     scene = MODEL / "scene.toml" if side == "right" else write_mirrored_patient(tmp_path)
     checked = check_scene(scene)
-    figure = draw_leg(checked.case, checked.mechanics)
+    figure = draw_leg(checked.case, checked.recording)
     knee = figure.axes[-1]
     words = {text.get_gid(): text for text in knee.texts}
     medial = words["side-left"].get_text() == "medial"

@@ -12,28 +12,29 @@ from tkamb.geometry.frames import transform
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.knee.equations import solve_knee
+from tkamb.knee.frame import Frame
 from tkamb.knee.load import PointForces
 from tkamb.knee.unknowns import UNKNOWNS
-from tkamb.run.mechanics import FrameLoads, Mechanics
-from tkamb.run.read_scene import mechanics_of
+from tkamb.run.read_scene import recording_of
+from tkamb.run.recording import Recording
 from tkamb.run.status import FAILED, frame_status
 
 MIDDLE = 60
 
 
 @cache
-def mechanics(friction: float = 0.05) -> Mechanics:
+def recording(friction: float = 0.05) -> Recording:
     """Return the equations of the shipped bend."""
-    return mechanics_of(load_case(load_scene(MODEL / "scene.toml", {"contact.friction": friction})))
+    return recording_of(load_case(load_scene(MODEL / "scene.toml", {"contact.friction": friction})))
 
 
 @cache
-def shipped_frame() -> FrameLoads:
+def shipped_frame() -> Frame:
     """Return the solved middle frame of the shipped bend."""
-    return mechanics().frame(MIDDLE)
+    return recording().loads(MIDDLE)
 
 
-def contact_axis(frame: FrameLoads) -> np.ndarray:
+def contact_axis(frame: Frame) -> np.ndarray:
     """Return the midpoint of the condyles' contact points (3,)."""
     return np.mean([condyle.point for condyle in frame.geometry.condyles.values()], axis=0)
 
@@ -79,7 +80,7 @@ def test_a_singular_frame_fails_and_the_other_frames_do_not(tmp_path):
     frame = shipped_frame()
     proximal = frame.geometry.extensor.patellar_ligament[0].points[0]
     distal = proximal + 1.3 * (contact_axis(frame) - proximal)
-    chain = mechanics().knee.chain
+    chain = recording().knee.chain
     in_tibia = transform(chain.insert_in_tibia, distal) * 1e3
     path = write_scene(
         tmp_path,
@@ -114,7 +115,7 @@ def test_a_quadriceps_through_the_patellofemoral_contact_makes_the_equations_sin
 @pytest.mark.parametrize("friction", [0.0, 1.0])
 def test_a_condyle_s_force_is_at_the_friction_angle_from_its_normal(friction):
     """Friction acts against the sliding."""
-    frame = mechanics(friction).frame(MIDDLE)
+    frame = recording(friction).loads(MIDDLE)
     assert frame.loads.problems == ()
     assert frame.loads.condition < 500.0
     for side, condyle in frame.geometry.condyles.items():
@@ -142,17 +143,17 @@ def noisy_scene(folder):
 def test_noise_of_fluoroscopy_is_flagged(tmp_path):
     path = noisy_scene(tmp_path)
     case = load_case(load_scene(path, {"contact.adjust": True}))
-    noisy = mechanics_of(case)
+    noisy = recording_of(case)
     changes, flag_count = [], 0
     for k in range(5, 101, 15):
-        frame = noisy.frame(k)
-        status, force = frame_status(case, k, frame, None), frame.loads.contact_force
+        frame = noisy.loads(k)
+        status, force = frame_status(case, k, frame), frame.loads.contact_force
         assert status.startswith(FAILED) == bool(np.isnan(force).any())
         if status.startswith(FAILED):
             continue
         assert frame.loads.condition < UNKNOWNS.max_condition
         flag_count += "filter moves the recorded pose" in status
-        clean = mechanics().frame(k).loads.contact_force
+        clean = recording().loads(k).loads.contact_force
         changes.append((np.linalg.norm(force) - np.linalg.norm(clean)) / case.body_weight)
     assert len(changes) >= 6
     assert flag_count >= 4

@@ -7,8 +7,8 @@ from scenes import fast_scene
 from tkamb.errors import InputError
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
-from tkamb.run.contact_side import COUPLING
-from tkamb.run.read_scene import contact_side, mechanics_of
+from tkamb.knee.frame import COUPLING
+from tkamb.run.read_scene import recording_of
 from tkamb.run.simulation import simulate
 
 SCENE = fast_scene()
@@ -46,15 +46,13 @@ def shares(results):
 
 def test_an_uncoupled_frame_is_a_contact_solution_at_the_load_of_the_equations():
     case = load_case(load_scene(SCENE, COARSE))
-    mechanics = mechanics_of(case)
-    side = contact_side(case, mechanics)
-    body, contact = side.frame(60)
-    uncoupled_body = mechanics.frame(60)
-    load = uncoupled_body.loads.contact_force[1]
-    pressed = side.model.press(side.state, load, mechanics.poses[60], None)
-    assert body.loads.contact_force[1] == load
-    assert np.array_equal(contact.result.pressure, pressed.pressure)
-    assert contact.iterations == 0
+    recording = recording_of(case)
+    contact, frame = recording.knee.contact, recording.frame(60)
+    load = recording.loads(60).loads.contact_force[1]
+    pressed = contact.model.press(contact.state, load, recording.poses[60], None)
+    assert frame.loads.contact_force[1] == load
+    assert np.array_equal(frame.contact.pressure, pressed.pressure)
+    assert frame.iterations == 0
 
 
 def test_coupled_points_converge_within_five_iterations(uncoupled, coupled):

@@ -248,11 +248,11 @@ def test_ground_reaction_fits_a_whole_body_in_balance(motion):
 
 def test_package_finds_the_patella_where_the_script_put_it(motion):
     from tkamb.io.scene.case import load_case
-    from tkamb.run.read_scene import mechanics_of
+    from tkamb.run.read_scene import recording_of
 
     case = load_case(load_scene(MODEL / "scene.toml", {"patella.motion": "solved"}))
     frames = np.arange(0, 101, 5)
-    states = mechanics_of(case, near=True).extensor.states
+    states = recording_of(case, near=True).extensor.states
     for k, state in zip(frames, states[::5], strict=True):
         ap, si, rotation = state.coordinates
         assert ap * 1e3 == pytest.approx(motion["patella_ap_mm"][k], abs=0.03)

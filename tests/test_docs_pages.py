@@ -5,6 +5,8 @@ import shlex
 import subprocess
 import sys
 import tomllib
+from importlib.machinery import SourceFileLoader
+from importlib.util import module_from_spec, spec_from_loader
 from pathlib import Path
 
 import pytest
@@ -106,3 +108,18 @@ def test_every_module_that_the_architecture_names_exists():
         places = (ROOT / "tkamb", ROOT, ROOT / "tkamb" / "run" / "muscles")
         missing = [n for n in named if not any((place / n).exists() for place in places)]
         assert not missing, f"{page.name}: {missing}"
+
+
+def test_the_architecture_shows_the_way_of_a_frame():
+    """The list names the files that a frame enters, in order; none of them is in io/."""
+    loader = SourceFileLoader("trace_frame", str(ROOT / "scripts" / "trace_frame"))
+    trace = module_from_spec(spec_from_loader("trace_frame", loader))
+    loader.exec_module(trace)
+    page = (DOCS / "architecture.md").read_text(encoding="utf-8")
+    shown = page.split(trace.BEGIN)[1].split(trace.END)[0]
+    files, traced = (
+        re.findall(r"^ +\S+\.py", t, re.M) for t in (shown, trace.table(trace.traced()))
+    )
+    assert files == traced, "run scripts/trace_frame"
+    assert f"It enters {len(files)} files" in shown
+    assert not any(name.strip().startswith("io/") for name in files)

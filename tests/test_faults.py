@@ -34,10 +34,10 @@ def plain_report(monkeypatch):
 
 @pytest.fixture
 def quick_case(monkeypatch):
-    """Read scenes and build their mechanics only once."""
+    """Read scenes and build their recording only once."""
     from tkamb.run import simulation
 
-    parts = ((simulation, "load_case", Scene.model_dump_json), (simulation, "mechanics_of", id))
+    parts = ((simulation, "load_case", Scene.model_dump_json), (simulation, "recording_of", id))
     for module, name, key_of in parts:
         cache = {}
 

@@ -12,7 +12,7 @@ from tkamb.geometry.frames import knee_pose
 from tkamb.io.recordings.tables import read_table
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
-from tkamb.run.read_scene import contact_side, mechanics_of
+from tkamb.run.read_scene import recording_of
 
 BEND = Path(__file__).parents[1] / "models" / "deep_knee_bend"
 ALL = ["ap", "ml", "axial_rotation", "adduction"]
@@ -42,11 +42,11 @@ def test_flexion_alone_gives_the_equilibrium_of_the_whole_recording(tmp_path):
     alone = load_case(scene_of(tmp_path, list(ROLES.values()), ALL))
     full = load_case(load_scene(BEND / "scene.toml", {"contact.released": ALL} | COARSE))
     assert set(alone.motion.unrecorded) == {*ALL, "si"}
-    sides = [contact_side(case, mechanics_of(case)) for case in (alone, full)]
+    recordings = [recording_of(case) for case in (alone, full)]
     for k in (30, 75):
-        contacts = [side.frame(k)[1] for side in sides]
-        assert not any(contact.problem for contact in contacts)
-        places = [contact.equilibrium.coordinates for contact in contacts]
+        frames = [recording.frame(k) for recording in recordings]
+        assert not any(frame.problem for frame in frames)
+        places = [frame.equilibrium.coordinates for frame in frames]
         difference = np.abs(places[0] - places[1])
         assert difference[:3].max() < 2e-4, k
         assert np.degrees(difference[3:]).max() < 0.3, k

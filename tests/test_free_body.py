@@ -26,7 +26,7 @@ from tkamb.io.recordings.meshes import axes_rotation, load_surface
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.run.muscles.shared_muscles import SharedMuscles
-from tkamb.run.read_scene import mechanics_of
+from tkamb.run.read_scene import recording_of
 
 MODELS = Path(__file__).parents[1] / "models"
 DATA = Path(__file__).parents[2] / "shared" / "data" / "dm"
@@ -47,7 +47,7 @@ needs_dm = pytest.mark.skipif(
 @pytest.fixture(scope="module")
 def shipped():
     case = load_case(load_scene(SHIPPED))
-    return Leg(SHIPPED), mechanics_of(case), case.motion.time
+    return Leg(SHIPPED), recording_of(case), case.motion.time
 
 
 @pytest.fixture(scope="module")
@@ -55,26 +55,26 @@ def dm():
     scene = load_scene(DM)
     scene = scene.model_copy(update={"motion": scene.motion.model_copy(update={"frames": 21})})
     case = load_case(scene)
-    mechanics, time = mechanics_of(case), case.motion.time
-    patella = np.array([state.coordinates for state in mechanics.extensor.states])
+    recording, time = recording_of(case), case.motion.time
+    patella = np.array([state.coordinates for state in recording.extensor.states])
     table = scene.implant.insert
     surface = load_surface(table.mesh, table.unit, table.axes, name="insert")
     turn = axes_rotation(table.axes)
     mesh = insert_placement(surface, turn) @ pose(turn, np.zeros(3))
-    return Leg(DM, mesh, (time, patella)), mechanics, time
+    return Leg(DM, mesh, (time, patella)), recording, time
 
 
 @pytest.mark.parametrize("k", SHIPPED_FRAMES)
 def test_the_shipped_knee_is_in_balance_on_free_bodies(shipped, k):
-    leg, mechanics, time = shipped
-    assert_same_loads(leg, mechanics.frame(k), time[k])
+    leg, recording, time = shipped
+    assert_same_loads(leg, recording.loads(k), time[k])
 
 
 @pytest.mark.parametrize("k", SHIPPED_FRAMES[1::2])
 def test_the_shipped_knee_with_muscles_across_it_is_in_balance(shipped, monkeypatch, k):
-    leg, mechanics, time = shipped
-    monkeypatch.setattr(mechanics, "muscles", SharedMuscles(two_flexors(len(time))))
-    frame = mechanics.frame(k)
+    leg, recording, time = shipped
+    monkeypatch.setattr(recording, "muscles", SharedMuscles(two_flexors(len(time))))
+    frame = recording.loads(k)
     assert frame.geometry.share.force[1:].min() > 20.0
     assert_same_loads(leg, frame, time[k])
 
@@ -82,8 +82,8 @@ def test_the_shipped_knee_with_muscles_across_it_is_in_balance(shipped, monkeypa
 @needs_dm
 @pytest.mark.parametrize("k", DM_FRAMES)
 def test_dm_is_in_balance_on_free_bodies(dm, k):
-    leg, mechanics, time = dm
-    assert_same_loads(leg, mechanics.frame(k), time[k])
+    leg, recording, time = dm
+    assert_same_loads(leg, recording.loads(k), time[k])
 
 
 def assert_same_loads(leg, frame, t):
@@ -129,9 +129,9 @@ def lent_muscles(share):
 
 
 def test_lines_that_wrap_nothing_run_between_the_scenes_points(shipped):
-    leg, mechanics, time = shipped
+    leg, recording, time = shipped
     for k in SHIPPED_FRAMES:
-        geometry = mechanics.frame(k).geometry
+        geometry = recording.loads(k).geometry
         extensor = geometry.extensor
         lines = {"patellar_ligament": extensor.patellar_ligament}
         if extensor.wrap == 0.0:
@@ -146,12 +146,12 @@ def test_lines_that_wrap_nothing_run_between_the_scenes_points(shipped):
 
 
 def test_the_free_bodies_notice_a_load_that_is_wrong_by_one_per_cent(shipped):
-    leg, mechanics, time = shipped
+    leg, recording, time = shipped
     k, ground = SHIPPED_FRAMES[3], leg.ground
-    reference = FreeBodies(leg, time[k], lent(mechanics.frame(k))).loads()
+    reference = FreeBodies(leg, time[k], lent(recording.loads(k))).loads()
     leg.ground = lambda t: 1.01 * ground(t)
     try:
-        changed = FreeBodies(leg, time[k], lent(mechanics.frame(k))).loads()
+        changed = FreeBodies(leg, time[k], lent(recording.loads(k))).loads()
     finally:
         leg.ground = ground
     assert abs(changed["muscle_quadriceps"] - reference["muscle_quadriceps"]) > 10 * FORCE

@@ -21,8 +21,8 @@ from tkamb.io.scene.scene import Scene, load_scene
 from tkamb.knee import contact_points, patellofemoral
 from tkamb.knee import equations as knee
 from tkamb.knee.chain import Chain
-from tkamb.run.mechanics import FrameLoads
-from tkamb.run.read_scene import mechanics_of
+from tkamb.knee.frame import Frame
+from tkamb.run.read_scene import recording_of
 
 FEW = 26
 FRAMES = (0, 9, 15, 23)
@@ -42,12 +42,12 @@ def shipped() -> Case:
 
 
 @cache
-def shipped_loads() -> list[FrameLoads]:
-    mechanics = mechanics_of(shipped())
-    return [mechanics.frame(k) for k in FRAMES]
+def shipped_loads() -> list[Frame]:
+    recording = recording_of(shipped())
+    return [recording.loads(k) for k in FRAMES]
 
 
-def numbers(frame: FrameLoads) -> np.ndarray:
+def numbers(frame: Frame) -> np.ndarray:
     """Return the loads of a frame: forces (N), moments (N·m), tensions (N)."""
     assert not frame.loads.problems
     loads = frame.loads
@@ -80,11 +80,11 @@ def turned(case: Case, rotation: np.ndarray, shift: np.ndarray) -> Case:
 @pytest.mark.parametrize("angle_deg", [17.0, 201.0])
 def test_turning_the_laboratory_about_the_vertical_changes_nothing(angle_deg):
     rotation = Rotation.from_euler("y", angle_deg, degrees=True).as_matrix()
-    mechanics = mechanics_of(turned(shipped(), rotation, np.array([0.4, -0.1, 1.3])))
+    recording = recording_of(turned(shipped(), rotation, np.array([0.4, -0.1, 1.3])))
     for k, before in zip(FRAMES, shipped_loads(), strict=True):
         expected = numbers(before)
         scale = np.abs(expected).max()
-        np.testing.assert_allclose(numbers(mechanics.frame(k)), expected, atol=1e-10 * scale)
+        np.testing.assert_allclose(numbers(recording.loads(k)), expected, atol=1e-10 * scale)
 
 
 def test_any_rotation_of_laboratory_and_gravity_changes_nothing():
@@ -92,11 +92,11 @@ def test_any_rotation_of_laboratory_and_gravity_changes_nothing():
     case = turned(shipped.__wrapped__(), rotation, np.zeros(3))
     gravity = rotation @ case.chain.model.gravity.linear
     case.chain.model.gravity = pin.Motion(gravity, np.zeros(3))
-    mechanics = mechanics_of(case)
+    recording = recording_of(case)
     for k, before in zip(FRAMES, shipped_loads(), strict=True):
         expected = numbers(before)
         scale = np.abs(expected).max()
-        np.testing.assert_allclose(numbers(mechanics.frame(k)), expected, atol=1e-10 * scale)
+        np.testing.assert_allclose(numbers(recording.loads(k)), expected, atol=1e-10 * scale)
 
 
 @pytest.mark.parametrize("axes", ["+y,+z,+x", "-x,+y,-z"])
@@ -125,11 +125,11 @@ def test_a_laboratory_with_other_axes_gives_the_same(tmp_path, axes):
             f'length_unit = "m"\nlaboratory_axes = "{axes}"\n'
         )
     _turn_columns(tmp_path / "ground_reaction.csv", to_laboratory)
-    mechanics = mechanics_of(load_case(load_scene(path)))
+    recording = recording_of(load_case(load_scene(path)))
     for k, before in zip(FRAMES, shipped_loads(), strict=True):
         expected = numbers(before)
         scale = np.abs(expected).max()
-        np.testing.assert_allclose(numbers(mechanics.frame(k)), expected, atol=1e-6 * scale)
+        np.testing.assert_allclose(numbers(recording.loads(k)), expected, atol=1e-6 * scale)
 
 
 def _turn_columns(path, to_laboratory):
@@ -266,9 +266,9 @@ def test_other_units_give_the_dimensionally_scaled_answer(monkeypatch):
     ml, lateral_yield, tilt_yield = patella.__defaults__
     scaled = (ml, lateral_yield * LENGTH, tilt_yield / LENGTH)
     monkeypatch.setattr(patella, "__defaults__", scaled)
-    mechanics = mechanics_of(scaled_case(shipped()))
+    recording = recording_of(scaled_case(shipped()))
     for k, before in zip(FRAMES, unscaled, strict=True):
-        after = mechanics.frame(k)
+        after = recording.loads(k)
         assert not after.loads.problems
         for name, value in before.loads.values.items():
             moment = "moment" in name or name == "residual_axial"
@@ -312,9 +312,9 @@ def test_slow_and_fast_recordings_of_the_same_motion_agree(tmp_path):
     forces = {}
     for rate in (20, 1000):
         case = load_case(load_scene(resampled_scene(tmp_path / str(rate), rate, 6.0)))
-        mechanics = mechanics_of(case)
+        recording = recording_of(case)
         chosen = [int(np.argmin(np.abs(case.motion.time - at))) for at in (1.3, 1.5, 1.7)]
-        frames = [mechanics.frame(k) for k in chosen]
+        frames = [recording.loads(k) for k in chosen]
         assert not any(frame.loads.problems for frame in frames)
         forces[rate] = np.array([frame.loads.contact_force for frame in frames])
     assert np.abs(forces[20] - forces[1000]).max() < 1e-4 * shipped().body_weight

@@ -304,7 +304,7 @@ def test_the_window_answers_only_its_own_page(knee, tmp_path):
 
 def test_an_unexpected_error_in_a_preparation_reaches_the_page(knee, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(knee, "_side", lambda request: 1 / 0)
+    monkeypatch.setattr(knee, "_recording", lambda request: 1 / 0)
     request = replace(states(knee)["pressed"], resolution_mm=7.0)
     with pytest.raises(TkambError, match="unexpected error: ZeroDivisionError"):
         list(iter(lambda: knee.preparing(request), ""))
@@ -317,11 +317,11 @@ def test_few_models_are_prepared_at_a_time_and_the_oldest_are_deleted(monkeypatc
     def slow(request):
         begun.append(request.resolution_mm)
         assert go_on.wait(60.0)
-        bench._sides[setting(request)] = None
+        bench._recordings[setting(request)] = None
         with bench._counting:
             bench._forget()
 
-    monkeypatch.setattr(bench, "_side", slow)
+    monkeypatch.setattr(bench, "_recording", slow)
     requests = [replace(bench.recorded(60), resolution_mm=1.0 + 0.1 * k) for k in range(12)]
     for request in requests:
         assert bench.preparing(request)
@@ -332,14 +332,14 @@ def test_few_models_are_prepared_at_a_time_and_the_oldest_are_deleted(monkeypatc
         while bench.preparing(request):
             time.sleep(0.005)
     assert not bench._threads
-    assert [*bench._sides] == [setting(one) for one in requests[-BENCH_LIMIT.kept_models :]]
+    assert [*bench._recordings] == [setting(one) for one in requests[-BENCH_LIMIT.kept_models :]]
 
 
 def test_an_insert_is_deleted_with_the_last_model_that_needs_it(knee):
     bench = LiveKnee(knee.case)
     bench._cases = dict.fromkeys((8.0, 9.0))
     bench._shared = dict.fromkeys((8.0, 9.0))
-    bench._sides = {("foundation", 2.0, 9.0): None}
+    bench._recordings = {("foundation", 2.0, 9.0): None}
     bench._forget()
     assert [*bench._cases] == [*bench._shared] == [9.0]
 

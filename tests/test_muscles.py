@@ -9,7 +9,7 @@ from tkamb.errors import InputError
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.knee.muscles import muscle_line
-from tkamb.run.read_scene import mechanics_of
+from tkamb.run.read_scene import recording_of
 
 ORIGIN = {"link": "femur", "point_mm": [32.0, 205.0, 0.0]}
 INSERTION = {"link": "patella", "point_mm": [8.0, 20.0, 0.0]}
@@ -39,12 +39,12 @@ def test_a_muscle_renamed_and_moved_by_data_pulls_with_its_own_moment_arm(tmp_pa
     """The generalised force of unit tension is -dL/dq for all nine joint coordinates."""
     origin = {"link": "femur", "point_mm": [25.0, 180.0, 9.0]}
     case = case_of(tmp_path, muscle("vastus_lateralis", (origin, INSERTION)))
-    mechanics = mechanics_of(case)
-    frame, chain = mechanics.frame(2), mechanics.knee.chain
+    recording = recording_of(case)
+    frame, chain = recording.loads(2), recording.knee.chain
     assert frame.loads.values["muscle_vastus_lateralis"] > 100.0
     assert "muscle_quadriceps" not in frame.loads.values
     line = muscle_line(case.muscles[0], chain, case.femoral)
-    motion, step = mechanics.instant(2).motion, 1e-6
+    motion, step = recording.instant(2).motion, 1e-6
 
     def length(joint, change):
         joints = motion.joints.copy()
@@ -64,8 +64,8 @@ def test_a_via_point_on_the_femur_lengthens_the_muscle_and_moves_its_pull(tmp_pa
     via = {"link": "femur", "point_mm": [45.0, 90.0, 0.0]}
     bent = case_of(tmp_path / "a", muscle(path=(ORIGIN, via, INSERTION), wraps=False))
     direct = case_of(tmp_path / "b", muscle(path=(via, INSERTION), wraps=False))
-    bent, direct = mechanics_of(bent), mechanics_of(direct)
-    far, near = (first.frame(0) for first in (bent, direct))
+    bent, direct = recording_of(bent), recording_of(direct)
+    far, near = (first.loads(0) for first in (bent, direct))
     assert not far.loads.problems
     for name, value in near.loads.values.items():
         assert far.loads.values[name] == pytest.approx(value, rel=1e-9, abs=1e-7)

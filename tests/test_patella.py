@@ -21,7 +21,7 @@ from tkamb.knee.patella import (
 )
 from tkamb.knee.patella_search import solve_patella
 from tkamb.knee.patellofemoral import PatellofemoralContact
-from tkamb.run.read_scene import mechanics_of
+from tkamb.run.read_scene import recording_of
 
 TROCHLEA, DOME = 0.025, 0.02
 CENTRE = np.array([0.004, 0.0, 0.0])
@@ -331,7 +331,7 @@ def shipped() -> tuple[Array, list[PatellaState]]:
     """Flexion (deg) and patella of every frame of the shipped deep knee bend."""
     path = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "scene.toml"
     case = load_case(load_scene(path, {"patella.motion": "solved"}))
-    frames = mechanics_of(case, near=True).extensor
+    frames = recording_of(case, near=True).extensor
     return np.rad2deg(case.motion.coordinates[:, 5]), frames.states
 
 
@@ -368,8 +368,8 @@ def test_shipped_patella_moves_smoothly(shipped: tuple[Array, list[PatellaState]
 def test_a_patella_lost_from_a_distant_guess_is_found_from_its_own_frame():
     """The search for frame 0 fails from the last frame and converges from frame 0."""
     starter = Path(starter_package.__file__).parent / "files" / "scene.toml"
-    mechanics = mechanics_of(load_case(load_scene(starter)))
-    extensor, pose = mechanics.extensor, mechanics.poses[0]
+    recording = recording_of(load_case(load_scene(starter)))
+    extensor, pose = recording.extensor, recording.poses[0]
     frame_state, last_state = extensor.states[0], extensor.states[-1]
     lost = solve_patella(extensor.lines.mechanism, pose, last_state.coordinates, last_state.slopes)
     assert not lost.status.found

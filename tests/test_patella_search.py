@@ -17,7 +17,7 @@ from tkamb.knee import extensor
 from tkamb.knee.chain import ChainMotion
 from tkamb.knee.patella import ExtensorMechanism, PatellaStatus
 from tkamb.knee.patella_search import solve_patella
-from tkamb.run.read_scene import SharedState, _extensor_frames, mechanics_of
+from tkamb.run.read_scene import SharedState, _extensor_frames, recording_of
 
 FEW = {"motion.frames": 11, "patella.motion": "solved", "contact.resolution_mm": 3.0}
 
@@ -28,7 +28,7 @@ def plain():
 
 
 def read(path):
-    return mechanics_of(load_case(load_scene(path, FEW)))
+    return recording_of(load_case(load_scene(path, FEW)))
 
 
 def turned_about_y(point):
@@ -57,7 +57,7 @@ def test_attachments_on_a_link_that_is_turned_on_the_patella_stay_where_they_are
     urdf.write_text(urdf.read_text(encoding="utf-8").replace("</robot>", link), encoding="utf-8")
     turned = read(path)
     for k in (2, 5, 8):
-        one, other = plain.frame(k).loads, turned.frame(k).loads
+        one, other = plain.loads(k).loads, turned.loads(k).loads
         assert not one.problems
         assert not other.problems
         for name, value in one.values.items():
@@ -141,7 +141,7 @@ def test_a_frame_that_loses_the_patella_fails_and_the_run_goes_on(plain, monkeyp
     assert np.isnan(results["force_total_N"][5])
     others = [k for k in range(11) if k != 5]
     assert not any(status[k].startswith("failed") for k in others)
-    quadriceps = [plain.frame(k).loads.values["muscle_quadriceps"] for k in others]
+    quadriceps = [plain.loads(k).loads.values["muscle_quadriceps"] for k in others]
     assert np.allclose(results["quadriceps_N"][others], quadriceps, atol=0.5)
 
 
@@ -181,17 +181,17 @@ def test_the_patella_stays_at_its_equilibrium_and_its_rates_are_filtered():
     The scene's chain without tkamb.Knee has the same coordinates and inertial forces.
     """
     case = load_case(load_scene(MODEL / "scene.toml", FEW | {"motion.cutoff_Hz": 1.0}))
-    mechanics, motion, tibia = mechanics_of(case), case.motion, case.tibia
-    solved = np.array([state.coordinates for state in mechanics.extensor.states])
+    recording, motion, tibia = recording_of(case), case.motion, case.tibia
+    solved = np.array([state.coordinates for state in recording.extensor.states])
     filtered, velocity, acceleration = case.rates(motion.time, solved)
     assert np.abs(filtered - solved).max() > 1e-5  # m, rad
     for k in (3, 8):
         knee = np.stack([motion.coordinates[k], motion.velocity[k], motion.acceleration[k]])
-        patella = mechanics.extensor.joints(k)
+        patella = recording.extensor.joints(k)
         np.testing.assert_array_equal(patella, [solved[k], velocity[k], acceleration[k]])
         joints = np.hstack([knee, patella])
         shank = (tibia.pose[k], tibia.velocity[k], tibia.acceleration[k])
-        recorded, geometry = case.chain.at(ChainMotion(*shank, joints)), mechanics.geometry(k)
+        recorded, geometry = case.chain.at(ChainMotion(*shank, joints)), recording.geometry(k)
         state = geometry.state
         for link in ("femur", "patella"):
             np.testing.assert_allclose(state.pose(link), recorded.pose(link), rtol=0, atol=1e-9)
@@ -200,10 +200,10 @@ def test_the_patella_stays_at_its_equilibrium_and_its_rates_are_filtered():
             for one in (state, recorded)
         ]
         np.testing.assert_allclose(*forces, rtol=1e-9, atol=1e-9)
-        np.testing.assert_array_equal(mechanics.instant(k).coordinates, motion.coordinates[k])
-        _, ligament = mechanics.extensor.lines.paths(state)
+        np.testing.assert_array_equal(recording.instant(k).coordinates, motion.coordinates[k])
+        _, ligament = recording.extensor.lines.paths(state)
         assert ligament.length == pytest.approx(case.patellar_ligament.length, abs=1e-7)
-        touch = mechanics.extensor.lines.given(mechanics.poses[k], patella[0])
+        touch = recording.extensor.lines.given(recording.poses[k], patella[0])
         assert abs(touch.gap) < 1e-7
 
 

@@ -19,7 +19,7 @@ from tkamb.knee.load import total_wrench
 from tkamb.knee.relaxation import Relaxation
 from tkamb.knee.released_forces import SCALE, ReleasedForces, external_wrench
 from tkamb.run.muscles.shared_muscles import SharedMuscles
-from tkamb.run.read_scene import contact_side, mechanics_of
+from tkamb.run.read_scene import recording_of
 from tkamb.run.simulation import simulate
 
 OG3 = MODEL.parent / "jw" / "ngait_og3.toml"
@@ -34,36 +34,36 @@ FRAMES = (40, 41, 42)
 def side_with_flexors(scene, left=False):
     """Return the shipped knee with quadriceps, hamstring and gastrocnemius."""
     case = load_case(load_scene(scene, CONTACT))
-    mechanics = mechanics_of(case)
+    recording = recording_of(case)
     trial = two_flexors(len(case.motion.time), least=0.02)
     if left:
         trial = replace(trial, shank=trial.shank @ MIRROR, thigh=trial.thigh @ MIRROR)
-    mechanics.muscles = SharedMuscles(trial, is_left=left)
-    return contact_side(case, mechanics)
+    recording.muscles = SharedMuscles(trial, is_left=left)
+    return recording
 
 
-def computed(side):
-    """Return body and contact of a few frames, each with the previous frame as initial guess."""
+def computed(recording):
+    """Return a few frames, each with the previous frame as initial guess."""
     results = []
     for k in FRAMES:
-        results.append(side.frame(k, [contact for _, contact in results]))
+        results.append(recording.frame(k, [frame.next for frame in results]))
     return results
 
 
 @pytest.fixture(scope="module")
-def side():
+def recording():
     return side_with_flexors(MODEL / "scene.toml")
 
 
 @pytest.fixture(scope="module")
-def equilibria(side):
-    return computed(side)
+def equilibria(recording):
+    return computed(recording)
 
 
-def test_the_shank_is_in_equilibrium_with_muscles(side, equilibria):
+def test_the_shank_is_in_equilibrium_with_muscles(recording, equilibria):
     """The loads are ground, weight, inertia, ligaments, muscles, contact and residuals."""
-    for body, _ in equilibria:
-        geometry, values = body.geometry, body.loads.values
+    for frame in equilibria:
+        geometry, values = frame.geometry, frame.loads.values
         assert geometry.share.force[1:].min() > 15.0
         loads = [*geometry.ligaments, *geometry.share.loads(geometry.state)]
         total = external_wrench(geometry, geometry.coordinates)
@@ -72,55 +72,53 @@ def test_the_shank_is_in_equilibrium_with_muscles(side, equilibria):
         total = total + values["patellar_ligament"] * total_wrench(pull, np.zeros(3))
         points = []
         for name, condyle in geometry.condyles.items():
-            force = -values[f"{name}_normal"] * condyle.direction(side.mechanics.friction)
+            force = -values[f"{name}_normal"] * condyle.direction(recording.knee.friction)
             total = total + push(force, condyle.point)
             points.append(condyle.point)
         residual = np.array([values["residual_ap"], 0.0, values["residual_ml"]])
         total = total + push(residual, np.mean(points, axis=0))
         total[4] += values["residual_axial"]
-        scale = np.linalg.norm(body.loads.contact_force)
+        scale = np.linalg.norm(frame.loads.contact_force)
         np.testing.assert_allclose(total, 0.0, atol=1e-8 * scale)
 
 
 def test_the_muscle_forces_satisfy_the_equations_of_the_released_knee(equilibria):
     """Static optimisation and equations give the same quadriceps tension to 1 N."""
-    for body, contact in equilibria:
-        quadriceps = body.geometry.extensor.tension(body.loads.values)
-        assert quadriceps == pytest.approx(body.geometry.share.force[0], abs=1.0)
+    for frame in equilibria:
+        quadriceps = frame.geometry.extensor.tension(frame.loads.values)
+        assert quadriceps == pytest.approx(frame.geometry.share.force[0], abs=1.0)
         assert quadriceps > 500.0
-        assert contact.iterations <= 6
+        assert frame.iterations <= 6
         for name in ("residual_ap", "residual_ml"):
-            assert abs(body.loads.values[name]) < 0.2
+            assert abs(frame.loads.values[name]) < 0.2
 
 
-def test_the_result_does_not_depend_on_the_initial_guess(side, equilibria):
+def test_the_result_does_not_depend_on_the_initial_guess(recording, equilibria):
     """Alone and after other frames, a frame has the same pose and the same muscle forces to 0.1 N.
 
     The compliance of an early pass would change a muscle force of 52 N by 8 N.
     """
-    (body, contact), (series, series_contact) = side.frame(FRAMES[-1]), equilibria[-1]
-    difference = (contact.equilibrium.coordinates - series_contact.equilibrium.coordinates) * SCALE
+    frame, series = recording.frame(FRAMES[-1]), equilibria[-1]
+    difference = (frame.equilibrium.coordinates - series.equilibrium.coordinates) * SCALE
     assert np.abs(difference).max() < 2e-6
-    np.testing.assert_allclose(body.geometry.share.force, series.geometry.share.force, atol=0.1)
+    np.testing.assert_allclose(frame.geometry.share.force, series.geometry.share.force, atol=0.1)
     force = series.loads.contact_force
-    np.testing.assert_allclose(body.loads.contact_force, force, atol=2e-4 * np.linalg.norm(force))
+    np.testing.assert_allclose(frame.loads.contact_force, force, atol=2e-4 * np.linalg.norm(force))
 
 
 def test_activations_are_continuous(equilibria):
-    activations = np.array([body.geometry.share.activation for body, _ in equilibria])
+    activations = np.array([frame.geometry.share.activation for frame in equilibria])
     assert np.abs(np.diff(activations, axis=0)).max() < 0.05
 
 
 def test_a_left_leg_with_muscles_gives_the_mirrored_result(tmp_path, equilibria):
     mirrored = side_with_flexors(write_mirrored_patient(tmp_path), left=True)
-    body, contact = mirrored.frame(FRAMES[0])
-    right_body, right_contact = equilibria[0]
-    np.testing.assert_allclose(
-        body.geometry.share.force, right_body.geometry.share.force, atol=1e-5
-    )
-    np.testing.assert_allclose(body.loads.contact_force, right_body.loads.contact_force, atol=1e-4)
-    coordinates = contact.equilibrium.coordinates
-    np.testing.assert_allclose(coordinates, right_contact.equilibrium.coordinates, atol=1e-9)
+    frame = mirrored.frame(FRAMES[0])
+    right = equilibria[0]
+    np.testing.assert_allclose(frame.geometry.share.force, right.geometry.share.force, atol=1e-5)
+    np.testing.assert_allclose(frame.loads.contact_force, right.loads.contact_force, atol=1e-4)
+    coordinates = frame.equilibrium.coordinates
+    np.testing.assert_allclose(coordinates, right.equilibrium.coordinates, atol=1e-9)
 
 
 def test_the_tension_per_wrench_is_that_of_a_second_search():

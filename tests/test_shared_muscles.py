@@ -215,8 +215,8 @@ def test_without_the_tables_neither_muscles_nor_emg_nor_measurements_are_importe
     code = (
         "import sys; from tkamb.io.scene import load_scene; "
         "from tkamb.io.scene.case import load_case; "
-        "from tkamb.run.read_scene import mechanics_of; "
-        f"m = mechanics_of(load_case(load_scene({str(SHIPPED)!r}))); assert m.muscles is None; "
+        "from tkamb.run.read_scene import recording_of; "
+        f"m = recording_of(load_case(load_scene({str(SHIPPED)!r}))); assert m.muscles is None; "
         f"print([n for n in sys.modules if n.startswith({modules})])"
     )
     process = subprocess.run(

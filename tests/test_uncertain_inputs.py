@@ -17,7 +17,7 @@ from tkamb.io.scene.case import load_case
 from tkamb.io.scene.uncertainty import CorrelationTable
 from tkamb.knee.load import PointForces
 from tkamb.run.muscles.shared_muscles import SharedMuscles
-from tkamb.run.read_scene import mechanics_of
+from tkamb.run.read_scene import recording_of
 from tkamb.studies.uncertainty.bands import influences
 from tkamb.studies.uncertainty.inputs import AXES, Draw, VariedInput, varied_inputs
 from tkamb.studies.uncertainty.run import estimate_uncertainty
@@ -136,10 +136,10 @@ def test_an_error_of_the_knee_centre_equals_an_opposite_shift_of_the_ground_reac
     shift = case.tibia.pose[:, :3, :3] @ (1e-3 * np.array(list(errors.values())))
     opposite = replace(case, ground=replace(case.ground, point=case.ground.point - shift))
     for k in (10, 60):
-        loads, expected = (mechanics_of(variant).frame(k).loads for variant in (sample, opposite))
+        loads, expected = (recording_of(variant).loads(k).loads for variant in (sample, opposite))
         assert loads.values == pytest.approx(expected.values, rel=1e-9, abs=1e-8)
         assert (
-            abs(loads.external_flexion - mechanics_of(case).frame(k).loads.external_flexion) > 5.0
+            abs(loads.external_flexion - recording_of(case).loads(k).loads.external_flexion) > 5.0
         )
 
 

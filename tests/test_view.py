@@ -101,8 +101,8 @@ def test_the_wrapped_part_of_a_tendon_has_another_colour(show):
 def test_strands_are_as_long_as_their_lines(show):
     run, drawing = show.runs[0], show.drawings[0]
     for row, frame in enumerate(run.frames):
-        state = run.mechanics.frame(frame).geometry.state
-        for path in run.mechanics.extensor.lines.paths(state):
+        state = run.recording.loads(frame).geometry.state
+        for path in run.recording.extensor.lines.paths(state):
             lengths = [
                 np.linalg.norm(np.diff(one.points[row], axis=0), axis=1).sum()
                 for one in drawing.strands
@@ -142,9 +142,9 @@ def test_a_failed_frame_does_not_affect_the_strain_scale(folder):
     """The pose of a failed frame may have very large strains."""
     run = open_run(folder)
     states = [one.state for one in run.geometries()]
-    strands, limit = ligament_strands(run.mechanics, states, run.results)
+    strands, limit = ligament_strands(run.recording, states, run.results)
     strains = {}
-    for one in run.mechanics.ligaments:
+    for one in run.recording.ligaments:
         poses = {
             end.link: np.stack([s.pose(end.link) for s in states])
             for end in (one.proximal, one.distal)
@@ -154,7 +154,7 @@ def test_a_failed_frame_does_not_affect_the_strain_scale(folder):
     worst = int(np.argmax(np.max(list(strains.values()), axis=0)))
     columns = dict(run.results.columns)
     columns["status"] = ["failed: x" if k == worst else "ok" for k in range(len(states))]
-    strands, limit = ligament_strands(run.mechanics, states, replace(run.results, columns=columns))
+    strands, limit = ligament_strands(run.recording, states, replace(run.results, columns=columns))
     largest = [np.max(np.delete(one, worst)) for one in strains.values()]
     assert limit == pytest.approx(max(largest))
     assert all((strand.colours[worst] == rgb(SLACK)).all() for strand in strands)

@@ -13,7 +13,7 @@ from tkamb.geometry.surface import Surface
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.run.metrics import METRICS
-from tkamb.run.read_scene import mechanics_of
+from tkamb.run.read_scene import recording_of
 from tkamb.show.style import PRESSURE_MAP
 from tkamb.show.view import drawing as colours
 from tkamb.show.view.draw import draw
@@ -109,7 +109,7 @@ def test_the_foot_is_on_the_floor_and_contains_the_ankle(run, drawing):
     foot = next(one for one in drawing.solids if one.name == "foot")
     floor = next(one for one in drawing.solids if one.name == "floor")
     for row, k in enumerate(run.frames):
-        ankle = run.mechanics.geometry(k).state.point("tibia", np.zeros(3))
+        ankle = run.recording.geometry(k).state.point("tibia", np.zeros(3))
         sole = transform(inverse(floor.poses[row]) @ foot.poses[row], foot.surface.vertices)
         assert abs(sole[:, 1].min()) < 1e-3
         local = transform(inverse(foot.poses[row]), ankle)
@@ -153,9 +153,9 @@ def test_the_bone_mesh_of_the_scene_is_drawn():
     if not data.is_dir():
         pytest.skip("subject DM's data are not beside the project")
     case = load_case(load_scene(DM, {"motion.frames": 26}))
-    mechanics = mechanics_of(case)
-    states = [mechanics.geometry(k).state for k in range(2)]
-    made = solids(case, mechanics.poses[:2], states, None, [-1] * 2)
+    recording = recording_of(case)
+    states = [recording.geometry(k).state for k in range(2)]
+    made = solids(case, recording.poses[:2], states, None, [-1] * 2)
     femur = next(one for one in made if one.name == "femur")
     given = trimesh.load(data / "geometry" / "bone_femur.stl")
     assert len(femur.surface.faces) == len(given.faces)

@@ -58,7 +58,7 @@ def _write_picture(check: "SceneCheck", path: Path) -> None:
     from tkamb.files import replaced_file, write_text
     from tkamb.show.leg_picture import draw_leg
 
-    figure = draw_leg(check.case, check.mechanics)
+    figure = draw_leg(check.case, check.recording)
     if path.suffix.lower() == ".html":
         write_text(path, check_html(check, figure))
         return

@@ -8,6 +8,7 @@ foot, a leg that hangs from a pelvis, and a whole body.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
@@ -65,7 +66,7 @@ class Anatomy:
     shank: tuple[int, ...]
     names: Mapping[str, str]
 
-    @property
+    @cached_property
     def fixed(self) -> bool:
         """Whether the tibia is fixed to the universe."""
         return self.tibia.joint == 0

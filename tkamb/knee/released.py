@@ -121,6 +121,26 @@ class KneeEquilibrium:
     second: str = ""
 
 
+def stored_equilibrium(
+    geometry: KneeGeometry, patella: "PatellaState | None", force: Array, stiffness: Array
+) -> KneeEquilibrium:
+    """Return an equilibrium of stored arrays, as initial guess of the next frame.
+
+    Args:
+        geometry: input of the equations at the stored coordinates.
+        patella: the patella at these coordinates; None: not modelled.
+        force: `Balance.force` of the last pass.
+        stiffness: `Balance.stiffness` of the last pass.
+    """
+    from tkamb.contact.model import ProbedContact
+
+    place, nan = geometry.coordinates, float("nan")
+    balance = Balance(place, force, stiffness, BalanceStatus.OK, 0, 0, nan, ())
+    return KneeEquilibrium(
+        place, geometry, patella, ProbedContact({}), balance, 0, 0, change=nan, problem=""
+    )
+
+
 def released_indices(names: Sequence[str]) -> tuple[int, ...]:
     """Return the indices of the released coordinates, including "si"."""
     return tuple(i for i, name in enumerate(KNEE_COORDINATES) if name == "si" or name in names)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 from typing import Literal
 
 WITHOUT_MUSCLES = "Without [muscles]"
@@ -362,6 +363,7 @@ def belongs(column: str, family: str) -> bool:
     return inside and column.startswith(before) and column.endswith(after)
 
 
+@cache
 def family_column(family: str, name: str) -> str:
     """Return the column of a family for one ligament, muscle or coordinate."""
     before, after = _ends(family)
@@ -384,6 +386,7 @@ def in_a_family(name: str) -> bool:
     return any(belongs(name, family) for family in FAMILIES)
 
 
+@cache
 def ligament_column(name: str) -> str:
     """Return the column of the ligament bundle `name`."""
     return family_column(LIGAMENT, name)

@@ -1,10 +1,9 @@
 """Knee, motion and ground reaction of a scene (`tkamb.read_scene`).
 
-`mechanics_of` and `contact_side` add the other parts of a run: muscles of [muscles], patella in all
-frames, femoral adjustment, post and coupling.
+`recording_of` adds the other parts of a run: muscles of [muscles], patella in all frames, femoral
+adjustment, post and coupling.
 """
 
-import time as clock
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,9 +17,10 @@ from tkamb.io.scene import Scene, load_scene
 from tkamb.io.scene.case import Case, load_case
 from tkamb.knee.chain import ChainMotion
 from tkamb.knee.contact_points import CONTACT_POINT, nearest_gap
+from tkamb.knee.frame import FrameMethod
 from tkamb.knee.knee import Knee
 from tkamb.knee.parts import Extensor, Implant
-from tkamb.run.mechanics import Ground, Mechanics, Motion
+from tkamb.run.recording import Ground, Motion, Recording
 from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from tkamb.contact.pair import ContactPair
     from tkamb.knee.contact import KneeContact
     from tkamb.knee.extensor import ExtensorFrames
-    from tkamb.run.contact_side import ContactSide
     from tkamb.run.muscles.shared_muscles import SharedMuscles
 
 STRAIN_FLEXIONS = (0.0, 60.0, 90.0)
@@ -71,8 +70,8 @@ def read_scene(scene: Scene | Case | str | Path) -> tuple[Knee, Motion, Ground]:
     case = scene if isinstance(scene, Case) else load_case(scene)
     if case.scene.muscles is not None:  # [muscles] is not part of the knee
         case = replace(case, scene=case.scene.model_copy(update={"muscles": None}))
-    mechanics = mechanics_of(case)
-    knee, motion, ground = mechanics.knee, mechanics.motion, mechanics.ground
+    recording = recording_of(case)
+    knee, motion, ground = recording.knee, recording.motion, recording.ground
     if knee.contact is not None:
         knee.contact.state  # noqa: B018  prepare the contact, so that errors occur here
     if ground is None:
@@ -81,19 +80,23 @@ def read_scene(scene: Scene | Case | str | Path) -> tuple[Knee, Motion, Ground]:
     return knee, motion, ground
 
 
-def mechanics_of(
+def recording_of(
     case: Case,
     shared: SharedState | None = None,
     near: bool = False,
     contact: "KneeContact | None" = None,
-) -> Mechanics:
-    """Return the rigid-body mechanics of a case.
+    split_sensitivity: bool = True,
+    cam: "CamPost | None" = None,
+) -> Recording:
+    """Return the knee of a case in the frames of its motion. The contact is not prepared here.
 
     Args:
         case: scene with its files read.
         shared: state of the nominal case, for a sample; None: the case is no sample.
         near: whether to skip the check that the condyles are near the insert.
         contact: prepared contact model; None: the contact model of the scene.
+        split_sensitivity: see `FrameMethod`.
+        cam: prepared cam and post with the same contact model; None: there are none yet.
 
     Raises:
         InputError: the parts of the scene do not fit together.
@@ -114,43 +117,22 @@ def mechanics_of(
         knee = knee.with_ligaments(bundles)
         strains = strain_table(bundles, links, flexion, STRAIN_FLEXIONS)
     motion = _motion(case, extensor)
+    muscles = shared.muscles if shared else _muscles(case)
+    ground, method = _ground(case, motion), _method(case, knee, split_sensitivity, cam)
+    return Recording(method, motion, ground, extensor, muscles, strains)
+
+
+def _method(case: Case, knee: Knee, split_sensitivity: bool, cam: "CamPost | None") -> FrameMethod:
+    """Return how the frames of a case are computed."""
     table, adjust = case.scene.contact, None
-    if table is not None and table.adjust:
+    if table is None:
+        return FrameMethod(knee)
+    if table.adjust:
         from tkamb.geometry.adjustment import AdjustmentSettings
 
         adjust = AdjustmentSettings(restore_when=table.adjust_restore_when)
-    muscles = shared.muscles if shared else _muscles(case)
-    ground = _ground(case, motion)
-    return Mechanics(knee, motion, ground, extensor, muscles, adjust, strains)
-
-
-def contact_side(
-    case: Case,
-    mechanics: Mechanics,
-    sensitivity: bool = True,
-    post: "CamPost | None" = None,
-) -> "ContactSide":
-    """Return the prepared contact side of a case with [contact].
-
-    Args:
-        case: the case.
-        mechanics: rigid-body mechanics of the case.
-        sensitivity: see `ContactSide`.
-        post: prepared cam and post; None: they are prepared here if the case has them.
-    """
-    from tkamb.knee.frame_contact import cam_on_post
-    from tkamb.run.contact_side import ContactSide
-
-    table, contact = case.scene.contact, mechanics.knee.contact
-    assert table is not None and contact is not None
-    start, cam = clock.perf_counter(), None
-    material = contact.state.pair.material
-    if case.post is not None:
-        cam = cam_on_post(contact.model, contact.pair, case.post, material, post)
-    seconds = clock.perf_counter() - start
-    return ContactSide(
-        mechanics, table.coupling == "points", table.released, cam, sensitivity, seconds
-    )
+    coupled, released = table.coupling == "points", tuple(table.released)
+    return FrameMethod(knee, coupled, released, adjust, split_sensitivity, case.post, cam)
 
 
 def link_poses(case: Case, poses: Array, extensor: "ExtensorFrames | None") -> dict[str, Array]:

@@ -37,6 +37,7 @@ from tkamb.files import (
 )
 from tkamb.geometry.frames import Array
 from tkamb.io.claim import settle
+from tkamb.run.recording import CONTACT_PLACES
 from tkamb.run.results_folder import (
     FOLDER,
     IDENTITY_NAME,
@@ -56,10 +57,6 @@ if TYPE_CHECKING:
 
 LARGEST = 2e9
 """bytes: largest size of a frame. A map of 100,000 points has 5 MB."""
-
-CONTACT_PLACES = ("contact_points", "contact_normals")
-"""Arrays (3, 3) of contact points, m, and unit normals of medial condyle, lateral condyle and
-patella; NaN without contact."""
 
 Row = dict[str, Any]
 T = TypeVar("T")
@@ -255,7 +252,7 @@ class Recorder:
         Args:
             frame: number of the frame.
             row: column of results.csv -> value.
-            contact: arrays of the contact result (`contact_arrays`); None: contact failed or is not
+            contact: arrays of the contact result (`frame_arrays`); None: contact failed or is not
                 modelled.
         """
         self.rows.add(frame, row)

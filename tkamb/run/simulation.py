@@ -6,7 +6,6 @@ import time as clock
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,8 +18,9 @@ from tkamb.run.guard import interrupt_as_such
 from tkamb.run.identity import input_hashes, run_identity, scene_hash
 from tkamb.run.metrics import peak_pressure
 from tkamb.run.plausibility.plausibility import Plausibility
-from tkamb.run.read_scene import contact_side, mechanics_of
+from tkamb.run.read_scene import recording_of
 from tkamb.run.recorder import FolderRecorder, Recorder, Row, finished_results
+from tkamb.run.recording import frame_arrays
 from tkamb.run.results import Results
 from tkamb.run.status import frame_status
 from tkamb.run.summary import summary_of
@@ -28,9 +28,9 @@ from tkamb.run.tabulate import frame_row
 from tkamb.run.workers import PoolOptions, Task, WorkerPool
 
 if TYPE_CHECKING:
-    from tkamb.knee.frame_contact import FrameContact
+    from tkamb.knee.contact import KneeContact
+    from tkamb.knee.frame import Frame, FrameStart
     from tkamb.knee.slip import CondyleSlip
-    from tkamb.run.contact_side import ContactSide
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ FRAME_LOOP = FrameLoopSettings()
 
 
 Finished = tuple[int, Row, dict[str, Array] | None]
-"""Frame, its row of results.csv, and the arrays of its contact (`contact_arrays`) or None."""
+"""Frame, its row of results.csv, and the arrays of its contact (`frame_arrays`) or None."""
 
 
 class FrameSolver:
@@ -61,9 +61,9 @@ class FrameSolver:
         slips: slips from another solver of this case; None: they are computed.
 
     Attributes:
-        mechanics: rigid-body mechanics of the case.
+        recording: knee and motion of the case.
         slips: side -> rolling and slip of a condyle in the recorded motion.
-        before: contacts of earlier frames, the initial guesses for the next frame.
+        before: starts of earlier frames, the initial guesses for the next frame.
 
     Raises:
         InputError: the input cannot be used.
@@ -73,43 +73,29 @@ class FrameSolver:
         self, case: Case, frames: range | None = None, slips: "dict[str, CondyleSlip] | None" = None
     ) -> None:
         self._case = case
-        self.mechanics = mechanics_of(case)
-        self.plausibility = Plausibility(case, self.mechanics)
+        self.recording = recording_of(case)
+        self.plausibility = Plausibility(case, self.recording)
         last = max(frames or range(len(case.motion.time)))
         if slips is None:  # slips belong to the recorded motion: none if coordinates are released
             released = case.scene.contact and case.scene.contact.released
-            slips = {} if released else self.mechanics.slips(last)
+            slips = {} if released else self.recording.slips(last)
         self.slips = slips
-        self.before: list[FrameContact] = []
+        self.before: list[FrameStart] = []
 
     def solve(self, k: int) -> Finished:
         """Compute frame k."""
-        contact = arrays = None
-        if self.side is None:
-            body = self.mechanics.frame(k)
-        else:
-            from tkamb.run.contact_side import contact_arrays
+        frame = self.recording.frame(k, self.before)
+        self._keep(frame)
+        flags = self.plausibility.flags(k, frame)
+        status = frame_status(self._case, k, frame, flags)
+        return k, frame_row(self._case, k, frame, self.slips, status), frame_arrays(frame)
 
-            body, contact = self.side.frame(k, self.before)
-            self._keep(contact)
-            arrays = contact_arrays(contact, body.geometry)
-        flags = self.plausibility.flags(k, body)
-        status = frame_status(self._case, k, body, contact, flags)
-        return k, frame_row(self._case, k, body, contact, self.slips, status), arrays
-
-    def _keep(self, contact: "FrameContact") -> None:
-        """Store a contact. Only the last one with a result has a warm start, which is large."""
-        if contact.result is not None:
-            self.before = [replace(each, start=None) for each in self.before]
-        self.before.append(contact)
+    def _keep(self, frame: "Frame") -> None:
+        """Store the start. Only the last one of a contact has a warm start, which is large."""
+        if frame.contact is not None:
+            self.before = [replace(each, contact=None) for each in self.before]
+        self.before.append(frame.next)
         del self.before[: -FRAME_LOOP.kept_contacts]
-
-    @cached_property
-    def side(self) -> "ContactSide | None":
-        """The contact side, prepared on first access; None without [contact]."""
-        if self._case.scene.contact is None:
-            return None
-        return contact_side(self._case, self.mechanics)
 
 
 Chunk = tuple[list[int], "dict[str, CondyleSlip]"]
@@ -282,17 +268,17 @@ class _Run:
             if not solver_is_installed():  # before the preparation, which may take minutes
                 raise solver_missing()
         self.solver = FrameSolver(self.case, self.indices)
-        side = self.solver.side
         self.seconds = {"read": clock.perf_counter() - self.start}
-        if side is not None:
-            self.seconds["prepare contact"] = side.prepare_seconds
-            self.seconds["read"] -= side.prepare_seconds
+        if self.case.scene.contact is not None:
+            start = clock.perf_counter()
+            self.solver.recording.method.prepare()
+            self.seconds["prepare contact"] = clock.perf_counter() - start
 
     def compute(self, recorder: Recorder, progress: Progress, team: WorkerPool | None) -> Results:
         """Compute the remaining frames and return the results."""
         self.recorder = recorder
-        if self.solver.side is not None:
-            self._begin_maps(self.solver.side)
+        if (contact := self.solver.recording.knee.contact) is not None:
+            self._begin_maps(contact)
         self._take_earlier()
         self.resumed = len(self.recorder.rows)
         remaining = [k for k in self.indices if k not in self.recorder.rows]
@@ -315,9 +301,9 @@ class _Run:
         """Return the results. Frames that are not computed yet are failed frames."""
         columns = self.recorder.rows.columns(self.case, self.indices)
         self.seconds["all"] = clock.perf_counter() - self.start
-        strains = self.solver.mechanics.strains
+        strains = self.solver.recording.strains
         summary = summary_of(self.case, columns, self.seconds, self.path, strains)
-        muscles = self.solver.mechanics.muscles
+        muscles = self.solver.recording.muscles
         if muscles is not None:
             summary["muscle_groups"] = muscles.groups
         plausibility = self.solver.plausibility
@@ -343,26 +329,22 @@ class _Run:
         frames = finished_in_order(team, self.solver.slips, self.indices, remaining)
         yield from (frame for _, frame in zip(progress(remaining), frames, strict=True))
 
-    def _begin_maps(self, side: "ContactSide") -> None:
+    def _begin_maps(self, contact: "KneeContact") -> None:
         labels = {
             "frame": "insert: x anterior, y superior, z lateral",
-            "model": side.model.name,
+            "model": contact.model.name,
             "version": str(self.identity["version of tkamb"]),
             "scene_sha256": scene_hash(self.case.scene),
             "licence": self.case.scene.output.licence or "not stated",
             "creator": f"tkamb {self.identity['version of tkamb']}",
         }
-        self.recorder.begin_maps(side.state.points, side.state.triangles, labels)
+        self.recorder.begin_maps(contact.state.points, contact.state.triangles, labels)
 
     def _take_earlier(self) -> None:
         """Read the frames of the run to resume. Its last contacts become initial guesses."""
-        earlier, side = self.recorder.take_earlier(self.indices), self.solver.side
-        if side is None or not earlier:
-            return
-        from tkamb.run.contact_side import recalled
-
-        mechanics, last = self.solver.mechanics, list(earlier.items())[-FRAME_LOOP.kept_contacts :]
-        self.solver.before = [recalled(side, mechanics, k, arrays) for k, arrays in last]
+        earlier, recording = self.recorder.take_earlier(self.indices), self.solver.recording
+        last = list(earlier.items())[-FRAME_LOOP.kept_contacts :]
+        self.solver.before = [recording.recalled(k, arrays) for k, arrays in last]
 
 
 def _dotted(overrides: Mapping[str, Any], tables: Mapping[str, Any]) -> dict[str, Any]:

@@ -17,8 +17,7 @@ from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.io.scene.case import Case
-    from tkamb.knee.frame_contact import FrameContact
-    from tkamb.run.mechanics import FrameLoads
+    from tkamb.knee.frame import Frame
 
 
 @dataclass(frozen=True)
@@ -48,47 +47,47 @@ AGREEMENT = AgreementSettings()
 NAN = float("nan")
 
 
-def contradictions(case: "Case", body: "FrameLoads", contact: "FrameContact | None") -> list[str]:
+def contradictions(case: "Case", frame: "Frame") -> list[str]:
     """Return the contradictions in a frame, in words; empty for a failed frame."""
-    if body.loads.problems:
+    if frame.loads.problems:
         return []
     words = []
-    values = body.loads.values
-    load = abs(float(body.loads.contact_force[1]))
+    values = frame.loads.values
+    load = abs(float(frame.loads.contact_force[1]))
     residual = float(np.hypot(values.get("residual_ap", 0.0), values.get("residual_ml", 0.0)))
     if residual > AGREEMENT.large_residual_share * load:
         words.append(f"residual AP and ML force is {_percent(residual, load)} of the contact force")
-    if contact is None or contact.result is None or case.split is None:
+    if frame.contact is None or case.split is None:
         return words
-    share, balanced = share_by_deformation(contact), share_by_equilibrium(body)
+    share, balanced = share_by_deformation(frame), share_by_equilibrium(frame)
     if abs(share - balanced) > AGREEMENT.share_difference:
         words.append(
             f"medial share {share:.2f} by deformation contradicts {balanced:.2f} by equilibrium"
         )
     for side, condyle_share in (("medial", share), ("lateral", 1.0 - share)):
-        if condyle_share < AGREEMENT.unloaded_share and side not in body.loads.lifted:
+        if condyle_share < AGREEMENT.unloaded_share and side not in frame.loads.lifted:
             words.append(f"{side} condyle carries nothing by deformation")
     return words
 
 
-def share_by_deformation(contact: "FrameContact") -> float:
+def share_by_deformation(frame: "Frame") -> float:
     """Return medial / (medial + lateral) of the contact model; NaN without load."""
-    result = contact.result
+    result = frame.contact
     if result is None:
         return NAN
     return share(*(side.force if side else 0.0 for side in (result.medial, result.lateral)))
 
 
-def share_by_equilibrium(body: "FrameLoads") -> float:
+def share_by_equilibrium(frame: "Frame") -> float:
     """Return medial / (medial + lateral) of the equations; NaN without a solution."""
-    return share(normal_force(body, "medial"), normal_force(body, "lateral"))
+    return share(normal_force(frame, "medial"), normal_force(frame, "lateral"))
 
 
-def normal_force(body: "FrameLoads", side: str) -> float:
+def normal_force(frame: "Frame", side: str) -> float:
     """Return a condyle's normal force by the equations, N; zero if it is lifted off."""
-    if side in body.loads.lifted and not np.isnan(body.loads.contact_force).any():
+    if side in frame.loads.lifted and not np.isnan(frame.loads.contact_force).any():
         return 0.0
-    return body.loads.values.get(f"{side}_normal", NAN)
+    return frame.loads.values.get(f"{side}_normal", NAN)
 
 
 def share(medial: float, lateral: float) -> float:
@@ -97,18 +96,18 @@ def share(medial: float, lateral: float) -> float:
     return medial / total if total > 0 else NAN
 
 
-def split_determined(body: "FrameLoads", contact: "FrameContact") -> float:
+def split_determined(frame: "Frame") -> float:
     """Return 1 if the recorded adduction determines the split by deformation, else 0.
 
     It is 0 if 0.5 deg of adduction shifts more than a quarter of the load between the condyles. It
     is 0 too if one condyle carries the whole load in contrast to equilibrium. NaN: the sensitivity
     to adduction is unknown.
     """
-    if np.isnan(contact.sensitivity):
+    if np.isnan(frame.sensitivity):
         return NAN
-    shifted = abs(contact.sensitivity) * AGREEMENT.adduction_error
-    load = abs(float(body.loads.contact_force[1]))
-    share, balanced = share_by_deformation(contact), share_by_equilibrium(body)
+    shifted = abs(frame.sensitivity) * AGREEMENT.adduction_error
+    load = abs(float(frame.loads.contact_force[1]))
+    share, balanced = share_by_deformation(frame), share_by_equilibrium(frame)
     alone = min(share, 1.0 - share) < AGREEMENT.unloaded_share < abs(share - balanced)
     return float(shifted <= AGREEMENT.moved_load_share * load and not alone)
 
@@ -153,8 +152,7 @@ FAILED = "failed: "
 def frame_status(
     case: "Case",
     k: int,
-    body: "FrameLoads",
-    contact: "FrameContact | None",
+    frame: "Frame",
     question_flags: Sequence[str] = (),
 ) -> str:
     """Return "ok", or reasons joined by "; ". The status of a failed frame begins with "failed".
@@ -162,65 +160,54 @@ def frame_status(
     Args:
         case: the case.
         k: index of the frame.
-        body: loads of the frame by the equations.
-        contact: contact of the frame; None: not modelled.
+        frame: loads and contact of the frame.
         question_flags: flags of the questions on the frame (`tkamb.run.plausibility`).
     """
-    failures = failures_of(body, contact)
-    words = [*_motion_flags(case, k), *_flank_flags(body), *_adjustment_flags(case, body)]
-    released = contact is not None and contact.equilibrium is not None
-    words += [_lift_off(body, side, released) for side in sorted(body.loads.lifted)]
-    words += _patella_flags(case, body)
-    if body.loads.slack and body.geometry.share is None:
+    words = [*_motion_flags(case, k), *_flank_flags(frame), *_adjustment_flags(case, frame)]
+    words += [_lift_off(frame, side) for side in sorted(frame.loads.lifted)]
+    words += _patella_flags(case, frame)
+    if frame.loads.slack and frame.geometry.share is None:
         words.append("flexors needed, which are not modelled: quadriceps slack")
-    if body.geometry.share is not None and not body.geometry.share.both_loaded:
+    if frame.geometry.share is not None and not frame.geometry.share.both_loaded:
         words.append("no muscle forces keep the least share of load on each condyle")
-    if body.loads.ambiguous:
+    if frame.loads.ambiguous:
         words.append("several load states are in equilibrium: the one with most loads is used")
-    words += contradictions(case, body, contact)
-    words += [*contact.flags, *(contact.post.flags if contact.post else ())] if contact else []
+    words += contradictions(case, frame)
+    words += [*frame.flags, *(frame.post.flags if frame.post else ())]
     words += question_flags
-    if failures:
-        return FAILED + "; ".join([*failures, *words])
+    if frame.failures:
+        return FAILED + "; ".join([*frame.failures, *words])
     return "; ".join(words) or "ok"
 
 
-def failures_of(body: "FrameLoads", contact: "FrameContact | None") -> list[str]:
-    """Return the reasons of a failed frame; empty if the frame has forces."""
-    result = list(body.loads.problems)
-    if contact and contact.problem and not result:
-        result.append(contact.problem)
-    return result
-
-
-def _lift_off(body: "FrameLoads", side: str, released: bool) -> str:
-    if released:
+def _lift_off(frame: "Frame", side: str) -> str:
+    if frame.equilibrium is not None:
         return f"{side} condyle lifts off"
-    if side in body.geometry.lifted:
-        where = "where the other one touches" if body.adjustment else "as recorded"
+    if side in frame.geometry.lifted:
+        where = "where the other one touches" if frame.adjustment else "as recorded"
         return f"{side} condyle off the insert {where}"
     return f"{side} condyle unloaded: the other one alone balances the adduction moment"
 
 
-def _flank_flags(body: "FrameLoads") -> list[str]:
+def _flank_flags(frame: "Frame") -> list[str]:
     """Return a flag for each condyle with a contact normal far from the vertical."""
     result = []
-    for side, condyle in body.geometry.condyles.items():
+    for side, condyle in frame.geometry.condyles.items():
         lean = float(np.arccos(np.clip(condyle.normal[1], -1.0, 1.0)))
-        if lean > STATUS.flank_angle and side not in body.loads.lifted:
+        if lean > STATUS.flank_angle and side not in frame.loads.lifted:
             result.append(
                 f"{side} contact on a flank, normal {lean / DEGREE:.0f} deg from vertical"
             )
     return result
 
 
-def _adjustment_flags(case: "Case", body: "FrameLoads") -> list[str]:
-    if body.effect is None or body.loads.problems:
+def _adjustment_flags(case: "Case", frame: "Frame") -> list[str]:
+    if frame.effect is None or frame.loads.problems:
         return []
-    change = abs(body.effect.force) / case.body_weight
+    change = abs(frame.effect.force) / case.body_weight
     if change <= STATUS.adjusted_total_BW:
         return []
-    return [f"femoral adjustment changes the total force by {change:.2f} BW: {body.effect.cause}"]
+    return [f"femoral adjustment changes the total force by {change:.2f} BW: {frame.effect.cause}"]
 
 
 def out_of_equilibrium(across: Array | float, normal: Array | float, body_weight: float) -> Mask:
@@ -235,12 +222,12 @@ def out_of_equilibrium(across: Array | float, normal: Array | float, body_weight
     return np.asarray(np.abs(across) > limit)
 
 
-def _patella_flags(case: "Case", body: "FrameLoads") -> list[str]:
+def _patella_flags(case: "Case", frame: "Frame") -> list[str]:
     """Return a flag if the recorded patella is not in equilibrium with its lines."""
     patella = case.scene.patella
-    if patella is None or patella.motion != "recorded" or body.loads.problems:
+    if patella is None or patella.motion != "recorded" or frame.loads.problems:
         return []
-    values = body.loads.values
+    values = frame.loads.values
     across = abs(values.get("patellofemoral_tangential", 0.0))
     normal = abs(values.get("patellofemoral", 0.0))
     if not out_of_equilibrium(across, normal, case.body_weight):

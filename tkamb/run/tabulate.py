@@ -22,7 +22,6 @@ from tkamb.run.columns import (
     family_column,
     ligament_column,
 )
-from tkamb.run.mechanics import FrameLoads
 from tkamb.run.status import FAILED, normal_force, share_by_equilibrium, split_determined
 from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
     from tkamb.io.recordings.marker_motion import MarkerKinematics
     from tkamb.knee.contact_points import CondylePoint
     from tkamb.knee.crossing import MuscleShare
-    from tkamb.knee.frame_contact import FrameContact
+    from tkamb.knee.frame import Frame
     from tkamb.knee.slip import CondyleSlip
 
 NAN = float("nan")
@@ -47,8 +46,7 @@ Columns = dict[str, Any]
 def frame_row(
     case: Case,
     k: int,
-    body: FrameLoads,
-    contact: "FrameContact | None",
+    frame: "Frame",
     slips: "Mapping[str, CondyleSlip]",
     status: str,
 ) -> dict[str, Any]:
@@ -59,21 +57,20 @@ def frame_row(
     Args:
         case: the case.
         k: index of the frame.
-        body: loads of the frame by the equations.
-        contact: contact of the frame; None: not modelled.
-        slips: side -> slip in the frames up to k + 1, see `Mechanics.slips`.
+        frame: loads and contact of the frame.
+        slips: side -> slip in the frames up to k + 1, see `Recording.slips`.
         status: status of the frame.
     """
     motion = _motion_row(case, k)
-    row = motion | _body_row(case, body)
+    row = motion | _body_row(case, frame)
     for side, slip in slips.items():
-        row |= _slip_row(case, k, side, slip, body.geometry.condyles.get(side))
-    if contact is not None:
-        row |= _contact_row(contact, case.scene.yield_stress_MPa * MEGAPASCAL)
-        row |= _pose_row(contact)
-        row["medial_force_per_adduction_N_per_deg"] = contact.sensitivity * DEGREE
-        row["split_determined"] = split_determined(body, contact)
-    row |= {"body_seconds": body.seconds, "query_seconds": body.query_seconds}
+        row |= _slip_row(case, k, side, slip, frame.geometry.condyles.get(side))
+    if frame.pressed:
+        row |= _contact_row(frame, case.yield_stress)
+        row |= _pose_row(frame)
+        row["medial_force_per_adduction_N_per_deg"] = frame.sensitivity * DEGREE
+        row["split_determined"] = split_determined(frame)
+    row |= {"body_seconds": frame.seconds, "query_seconds": frame.query_seconds}
     if status.startswith(FAILED):
         columns_kept = {*motion, *WHY_IT_FAILED}
         row = {name: value if name in columns_kept else NAN for name, value in row.items()}
@@ -148,7 +145,7 @@ def _marker_row(markers: "MarkerKinematics", time: Array) -> dict[str, Any]:
     return row
 
 
-def _body_row(case: Case, frame: FrameLoads) -> dict[str, float]:
+def _body_row(case: Case, frame: "Frame") -> dict[str, float]:
     loads, values, extensor = frame.loads, frame.loads.values, frame.geometry.extensor
     on_insert = -loads.contact_force
     for push in frame.geometry.post[:1]:  # the load on the tibia; the second is on the femur
@@ -245,11 +242,11 @@ def _slip_row(
     return {f"{side}_{name}": float(value) / MILLIMETRE for name, value in values.items()}
 
 
-def _contact_row(frame: "FrameContact", yield_stress: float) -> dict[str, float]:
-    result = frame.result
+def _contact_row(frame: "Frame", yield_stress: float) -> dict[str, float]:
+    result = frame.contact
     row = {
         "approach_mm": result.approach / MILLIMETRE if result else NAN,
-        "contact_seconds": frame.seconds,
+        "contact_seconds": frame.contact_seconds,
         "iterations": result.iterations if result else NAN,
     }
     if frame.adjustment:
@@ -277,9 +274,9 @@ def _post_row(post: "PostContact") -> dict[str, float]:
     }
 
 
-def _pose_row(frame: "FrameContact") -> dict[str, float]:
+def _pose_row(frame: "Frame") -> dict[str, float]:
     """Return the pose of the contact, and the convergence of the coupling."""
-    place = knee_coordinates(frame.result.pose) if frame.result else np.full(6, NAN)
+    place = knee_coordinates(frame.contact.pose) if frame.contact else np.full(6, NAN)
     named = dict(zip(KNEE_COORDINATES, place.tolist(), strict=True))
     row = {f"{axis}_mm": named[axis] / MILLIMETRE for axis in ("ap", "si", "ml")}
     if frame.iterations:
@@ -299,8 +296,8 @@ def _pose_row(frame: "FrameContact") -> dict[str, float]:
     )
 
 
-def _condyle_row(side: str, frame: "FrameContact", limit: float) -> dict[str, float]:
-    result = frame.result
+def _condyle_row(side: str, frame: "Frame", limit: float) -> dict[str, float]:
+    result = frame.contact
     condyle = getattr(result, side) if result else None
     if result is not None and condyle is None:
         values = {"force_N": 0.0, "area_mm2": 0.0}

@@ -22,7 +22,7 @@ from tkamb.geometry.frames import Array, transform
 from tkamb.geometry.surface import Surface
 from tkamb.io.scene.case import Case
 from tkamb.knee.chain import ChainState
-from tkamb.run.mechanics import Mechanics
+from tkamb.run.recording import Recording
 from tkamb.show.style import (
     BLACK,
     FORCE_COLOURS,
@@ -99,9 +99,9 @@ def shown_frames(case: Case) -> list[int]:
     return sorted(result)
 
 
-def leg_frame(case: Case, mechanics: Mechanics, k: int) -> LegFrame:
+def leg_frame(case: Case, recording: Recording, k: int) -> LegFrame:
     """Return the leg in frame k."""
-    state = mechanics.geometry(k).state
+    state = recording.geometry(k).state
     to_laboratory = state.insert_in_laboratory
     in_insert = [state.point("hip", np.zeros(3)), np.zeros(3), state.point("tibia", np.zeros(3))]
     parts = (
@@ -116,7 +116,7 @@ def leg_frame(case: Case, mechanics: Mechanics, k: int) -> LegFrame:
     )
     lines = [
         (transform(to_laboratory, points), colour, name)
-        for points, colour, name in _lines(mechanics, state)
+        for points, colour, name in _lines(recording, state)
     ]
     force, point = None, transform(to_laboratory, in_insert[2])
     if case.ground is not None:
@@ -128,21 +128,21 @@ def leg_frame(case: Case, mechanics: Mechanics, k: int) -> LegFrame:
     return LegFrame(k, joints, bodies, tuple(lines), force, point, loaded)
 
 
-def _lines(mechanics: Mechanics, state: ChainState) -> list[tuple[Array, str, str]]:
+def _lines(recording: Recording, state: ChainState) -> list[tuple[Array, str, str]]:
     """Return ligaments, muscle and patellar ligament as points in the insert frame, colour, name.
 
     The name is empty except for the first strand of a ligament.
     """
     segments: list[tuple[Array, str, str]] = []
     named: set[str] = set()
-    for bundle in mechanics.ligaments:
+    for bundle in recording.ligaments:
         poses = {link: state.pose(link) for link in (bundle.proximal.link, bundle.distal.link)}
         name = bundle.name.removeprefix("generic_").split("_")[0].rstrip("0123456789")
         segments.append((np.stack(bundle.ends(poses)), LIGAMENT, "" if name in named else name))
         named.add(name)
-    if mechanics.extensor is not None:
+    if recording.extensor is not None:
         with suppress(ComputationError):  # the pose of the patella has no solution in this frame
-            quadriceps, ligament = mechanics.extensor.lines.paths(state)
+            quadriceps, ligament = recording.extensor.lines.paths(state)
             segments.append((quadriceps.points, QUADRICEPS, ""))
             segments.append((ligament.points, PATELLAR_LIGAMENT, ""))
     return segments
@@ -170,10 +170,10 @@ class View:
         return np.stack([points @ self.across, points[..., 1]], axis=-1)
 
 
-def draw_leg(case: Case, mechanics: Mechanics) -> Figure:
+def draw_leg(case: Case, recording: Recording) -> Figure:
     """Return the picture of a case: three frames side by side, four views below each other."""
-    frames = [leg_frame(case, mechanics, k) for k in shown_frames(case)]
-    ahead = np.mean([_ahead(mechanics, one.frame) for one in frames], axis=0)
+    frames = [leg_frame(case, recording, k) for k in shown_frames(case)]
+    ahead = np.mean([_ahead(recording, one.frame) for one in frames], axis=0)
     ahead /= np.linalg.norm(ahead)
     lateral = np.cross(ahead, [0.0, 1.0, 0.0])
     mirror = -1.0 if case.scene.patient.side == "left" else 1.0
@@ -206,9 +206,9 @@ def draw_leg(case: Case, mechanics: Mechanics) -> Figure:
     return figure
 
 
-def _ahead(mechanics: Mechanics, k: int) -> Array:
+def _ahead(recording: Recording, k: int) -> Array:
     """Return the horizontal part (3,) of the insert's x axis in the laboratory frame."""
-    state = mechanics.geometry(k).state
+    state = recording.geometry(k).state
     return state.insert_in_laboratory[:3, 0] * np.array([1.0, 0.0, 1.0])
 
 

@@ -18,9 +18,9 @@ from tkamb.io.given_material import (
 )
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import Case, load_case
-from tkamb.run.mechanics import Mechanics
 from tkamb.run.plausibility.plausibility import Plausibility
-from tkamb.run.read_scene import STRAIN_FLEXIONS, mechanics_of
+from tkamb.run.read_scene import STRAIN_FLEXIONS, recording_of
+from tkamb.run.recording import Recording
 from tkamb.run.summary import assumptions, not_modelled
 from tkamb.units import DEGREE, MILLIMETRE
 
@@ -63,7 +63,7 @@ class Entry:
         return f"{self.part}{where}: {self.found}"
 
 
-def inventory(case: Case, mechanics: Mechanics) -> tuple[Entry, ...]:
+def inventory(case: Case, recording: Recording) -> tuple[Entry, ...]:
     """Return the content of every file and table of a case."""
     result = [_patient(case), _motion(case)]
     if case.scene.tibia or case.motion.markers:
@@ -71,8 +71,8 @@ def inventory(case: Case, mechanics: Mechanics) -> tuple[Entry, ...]:
     if case.ground is not None:
         result.append(_ground(case))
     result += _surfaces(case)
-    if mechanics.ligaments:
-        result.append(_ligaments(mechanics))
+    if recording.ligaments:
+        result.append(_ligaments(recording))
     if case.muscles:
         result.append(_extensor(case))
     if case.scene.muscles:
@@ -179,16 +179,16 @@ def _surface(surface: Surface) -> str:
     )
 
 
-def _ligaments(mechanics: Mechanics) -> Entry:
+def _ligaments(recording: Recording) -> Entry:
     """Return the bundles, the range of their strains, and the high strains with their flexion."""
-    strains = mechanics.strains
+    strains = recording.strains
     strained = [
         f"{name} {100 * value:.0f} % at {flexion:.0f} deg"
         for name, values in strains.items()
         for flexion, value in zip(STRAIN_FLEXIONS, values, strict=True)
         if value > INVENTORY.high_strain
     ]
-    text = f"{len(mechanics.ligaments)} bundles: {_listed([b.name for b in mechanics.ligaments])}"
+    text = f"{len(recording.ligaments)} bundles: {_listed([b.name for b in recording.ligaments])}"
     finite = np.array([v for values in strains.values() for v in values if np.isfinite(v)])
     if len(finite):
         text += f"; {_range('strain', 100 * finite, '%', 1)} at the recorded pose"
@@ -254,7 +254,7 @@ class SceneCheck:
     Args:
         scene: path of the scene file.
         case: content of the scene and its files.
-        mechanics: model of the leg, muscles and ligaments.
+        recording: knee and motion of the case.
         entries: content of each file and table.
         not_modelled: names of parts that the scene leaves out.
         assumptions: assumptions of the results.
@@ -265,7 +265,7 @@ class SceneCheck:
 
     scene: Path
     case: Case
-    mechanics: Mechanics
+    recording: Recording
     entries: tuple[Entry, ...]
     not_modelled: tuple[str, ...]
     assumptions: tuple[str, ...]
@@ -335,14 +335,14 @@ def check_scene(
         given_material(scene.insert_material)
     case = load_case(scene)
     begin("placing leg, patella and muscles")
-    mechanics = mechanics_of(case)
+    recording = recording_of(case)
     begin("checking for unlikely values")
-    plausibility = Plausibility(case, mechanics)
+    plausibility = Plausibility(case, recording)
     return SceneCheck(
         Path(path),
         case,
-        mechanics,
-        inventory(case, mechanics),
+        recording,
+        inventory(case, recording),
         (*not_modelled(case), *_beyond(case)),
         tuple(assumptions(case)),
         tuple(question.text for question in plausibility.questions),

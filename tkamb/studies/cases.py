@@ -265,22 +265,22 @@ def _shipped(name: str) -> StudyCase:
 def _of_scene(name: str, path: Path, flexion: float) -> StudyCase:
     from tkamb.io.scene import load_scene
     from tkamb.io.scene.case import load_case
-    from tkamb.run.read_scene import mechanics_of
+    from tkamb.run.read_scene import recording_of
 
     case = load_case(load_scene(path))
     table, insert = case.scene.contact, case.scene.implant.insert
     if table is None or insert is None or case.femoral is None or case.insert is None:
         raise InputError("has no [contact]", path, "the trade-off needs two bodies")
-    mechanics = mechanics_of(case)
+    recording = recording_of(case)
     k = int(np.argmin(np.abs(case.motion.coordinates[:, 5] - flexion * DEGREE)))
-    load = float(mechanics.frame(k).loads.contact_force[1])
+    load = float(recording.loads(k).loads.contact_force[1])
     if not load > 0:
         raise InputError(f"frame {k} has no compressive contact force", path)
     pair = ContactPair(
         case.femoral, case.insert, given_material(case.scene.insert_material), insert.bearing
     )
     label = f"{path.parent.name} at {case.motion.coordinates[k, 5] / DEGREE:.0f} deg, {load:.0f} N"
-    return StudyCase(name, label, pair, mechanics.poses[k], load)
+    return StudyCase(name, label, pair, recording.poses[k], load)
 
 
 def copied_scene(folder: Path) -> Path:

@@ -22,6 +22,7 @@ from tkamb.io.scene.parts import (
 )
 from tkamb.io.scene.scene import Scene
 from tkamb.knee.chain import Chain
+from tkamb.units import MEGAPASCAL
 
 if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
@@ -99,7 +100,7 @@ class Case:
         remarks = [remark for part in parts if part is not None for remark in part.remarks]
         return tuple(dict.fromkeys(remarks))
 
-    @property
+    @cached_property
     def gait_cycle_s(self) -> tuple[float, float] | None:
         """Times of 0 and 100 % of the gait cycle, s, from the scene or else the force plates.
 
@@ -130,10 +131,15 @@ class Case:
         patient = self.scene.patient
         return None if patient.height_mm is None else patient.height_mm * patient.scale
 
-    @property
+    @cached_property
     def body_weight(self) -> float:
         """Body weight at the scene's scale, N."""
         return self.body_mass * -float(self.chain.model.gravity.linear[1])
+
+    @cached_property
+    def yield_stress(self) -> float:
+        """Yield stress of the insert, Pa, to which the column `area_above_yield` refers."""
+        return self.scene.yield_stress_MPa * MEGAPASCAL
 
 
 def _recordings(

@@ -26,7 +26,8 @@ from tkamb.run.plausibility.movement import (
 from tkamb.run.plausibility.segments import implant_questions, segment_questions
 
 if TYPE_CHECKING:
-    from tkamb.run.mechanics import FrameLoads, Mechanics
+    from tkamb.knee.frame import Frame
+    from tkamb.run.recording import Recording
 
 ANSWERS = "[output] answers"
 
@@ -48,7 +49,7 @@ class Plausibility:
 
     Args:
         case: the case.
-        mechanics: mechanics of the case.
+        recording: knee and motion of the case.
 
     Attributes:
         questions: questions without an answer in the scene.
@@ -58,8 +59,8 @@ class Plausibility:
         InputError: an answer is empty, or belongs to no question.
     """
 
-    def __init__(self, case: Case, mechanics: "Mechanics") -> None:
-        self._case, self._mechanics = case, mechanics
+    def __init__(self, case: Case, recording: "Recording") -> None:
+        self._case, self._recording = case, recording
         result = [
             *segment_questions(case),
             *motion_questions(case),
@@ -75,22 +76,22 @@ class Plausibility:
             *sign_questions(case),
         ]
         if case.ligaments or case.muscles:
-            result += _line_questions(case, mechanics)
+            result += _line_questions(case, recording)
         self.questions, self.answered = _answered(result, case.scene.output.answers)
 
-    def flags(self, k: int, body: "FrameLoads") -> list[str]:
+    def flags(self, k: int, frame: "Frame") -> list[str]:
         """Return the flags for the status of frame k."""
         words = [
             question.flag for question in self.questions if question.flag and question.concerns(k)
         ]
-        if self._mechanics.ligaments:
+        if self._recording.ligaments:
             from tkamb.run.plausibility.lines import LINE_LIMITS, torn_bundles
 
-            if torn := torn_bundles(self._mechanics.ligaments, body.geometry.tensions):
+            if torn := torn_bundles(self._recording.ligaments, frame.geometry.tensions):
                 words.append(
                     f"ligament strain above {100 * LINE_LIMITS.max_strain:.0f} %: {some(torn)}"
                 )
-        force = float(np.linalg.norm(body.loads.contact_force)) / self._case.body_weight
+        force = float(np.linalg.norm(frame.loads.contact_force)) / self._case.body_weight
         if force > FORCE_LIMITS.max_force_BW:
             words.append(f"contact force of {force:.1f} BW, above all forces measured in knees")
         return words
@@ -121,14 +122,14 @@ def _answered(
     return tuple(unanswered), tuple(text)
 
 
-def _line_questions(case: Case, mechanics: "Mechanics") -> list[Question]:
+def _line_questions(case: Case, recording: "Recording") -> list[Question]:
     from tkamb.run.plausibility import lines
     from tkamb.run.read_scene import link_poses
 
     result = [*lines.attachment_questions(case), *lines.stiffness_questions(case)]
-    poses = link_poses(case, mechanics.poses, mechanics.extensor)
+    poses = link_poses(case, recording.poses, recording.extensor)
     result += lines.extensor_questions(case, poses)
     if not (case.scene.contact and case.scene.contact.released):
-        strains = {b.name: b.strain(b.length(poses)) for b in mechanics.ligaments}
-        result += lines.strain_questions(mechanics.ligaments, strains, case.motion.time)
+        strains = {b.name: b.strain(b.length(poses)) for b in recording.ligaments}
+        result += lines.strain_questions(recording.ligaments, strains, case.motion.time)
     return result

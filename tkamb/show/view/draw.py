@@ -40,11 +40,11 @@ def draw(
     """Return the drawing of a run.
 
     Args:
-        run: case, mechanics and results that belong together.
+        run: case, recording and results that belong together.
         progress: function that wraps the frame indices, for example a progress bar.
         lattice: whether the cells of the lattice are drawn too.
     """
-    case, mechanics, results = run.case, run.mechanics, run.results
+    case, recording, results = run.case, run.recording, run.results
     geometries = run.geometries(progress)
     states = [one.state for one in geometries]
     maps, result = results.maps, map_rows(results)
@@ -52,9 +52,9 @@ def draw(
     contact = case.scene.contact
     floor, centre = floor_and_foot(case, geometries, run.frames)
     others = floor + worn_insert(results, case.scene.patient.side)
-    bundles, limit = ligament_strands(mechanics, states, results)
+    bundles, limit = ligament_strands(recording, states, results)
     muscles, most_active = muscle_strands(geometries)
-    strands = [*bundles, *extensor_strands(mechanics, states, results), *muscles]
+    strands = [*bundles, *extensor_strands(recording, states, results), *muscles]
     markers = [*contact_markers(geometries), *centre]
     if maps is not None and result:
         assert case.insert is not None
@@ -71,7 +71,7 @@ def draw(
         times=results["time_s"],
         statuses=tuple(results.status),
         readings=readings(results, axis),
-        solids=solids(case, mechanics.poses[list(run.frames)], states, maps, rows) + others,
+        solids=solids(case, recording.poses[list(run.frames)], states, maps, rows) + others,
         strands=tuple(strands),
         arrows=force_arrows(results, geometries, contact.friction if contact else 0.0),
         markers=tuple(markers),

@@ -16,8 +16,8 @@ from tkamb.knee.chain import ChainState
 from tkamb.knee.equations import KneeGeometry
 from tkamb.knee.load import PointForces
 from tkamb.knee.wrapping import TautPath
-from tkamb.run.mechanics import Mechanics
 from tkamb.run.metrics import failed, stretches
+from tkamb.run.recording import Recording
 from tkamb.show.style import BLACK, FORCE_COLOURS, SIDE_COLOURS
 from tkamb.show.view.drawing import (
     SLACK,
@@ -230,13 +230,13 @@ VIEW_STRAND = ViewStrandSettings()
 
 
 def ligament_strands(
-    mechanics: Mechanics, states: Sequence[ChainState], results: "Results"
+    recording: Recording, states: Sequence[ChainState], results: "Results"
 ) -> tuple[tuple[Strand, ...], float]:
     """Return the bundles, coloured by strain, and the upper end of the colour scale.
 
     The bundles of a failed frame are grey and do not affect the scale.
     """
-    bundles = mechanics.ligaments
+    bundles = recording.ligaments
     if not bundles:
         return (), 0.0
     links = {link for one in bundles for link in (one.proximal.link, one.distal.link)}
@@ -254,13 +254,13 @@ def ligament_strands(
 
 
 def extensor_strands(
-    mechanics: Mechanics, states: Sequence[ChainState], results: "Results"
+    recording: Recording, states: Sequence[ChainState], results: "Results"
 ) -> tuple[Strand, ...]:
     """Return muscle and patellar ligament. Their parts on the bone have another colour.
 
     A strand with less than `slack_force` is grey.
     """
-    extensor = mechanics.extensor
+    extensor = recording.extensor
     if extensor is None:
         return ()
     paths: list[tuple[TautPath | None, ...]] = []

@@ -18,12 +18,11 @@ from tkamb.geometry.frames import KNEE_COORDINATES, SIDES, Array, Index, knee_po
 from tkamb.io.recordings.patient import load_urdf
 from tkamb.io.scene.case import Case, with_insert
 from tkamb.knee.chain import Chain
-from tkamb.knee.frame_contact import FrameContact
-from tkamb.run.contact_side import ContactSide
+from tkamb.knee.frame import Frame, FrameStart
 from tkamb.run.guard import unforeseen_words
 from tkamb.run.known_errors import as_json, known_error
-from tkamb.run.mechanics import FrameLoads, Mechanics
-from tkamb.run.read_scene import SharedState, contact_side, mechanics_of
+from tkamb.run.read_scene import SharedState, recording_of
+from tkamb.run.recording import Recording
 from tkamb.show.view.bench import BENCH_LIMIT, ROWS, Bench, BenchRequest
 from tkamb.show.view.bench_scene import write_bench
 from tkamb.studies.designs.design import DESIGN_FILE, load_design
@@ -148,16 +147,16 @@ class LiveKnee:
         if case.scene.patient.scale != 1.0:
             raise InputError("is scaled", "[patient] scale", "tkamb live needs scale = 1")
         self.case = _without_muscles(case)
-        self.bench = Bench(self.case, mechanics_of(self.case, near=True).ligaments)
+        self.bench = Bench(self.case, recording_of(self.case, near=True).ligaments)
         self._session = session or Path(tempfile.mkdtemp(prefix="tkamb-live-"))
         weakref.finalize(self, shutil.rmtree, self._session, True)
         self.design = parametric_insert(case, self._session)
         self._cases: dict[float | None, Case] = {}
         self._shared: dict[float | None, SharedState] = {}
-        self._sides: dict[Setting, ContactSide] = {}
+        self._recordings: dict[Setting, Recording] = {}
         self._threads: dict[Setting, Thread] = {}
         self._refused: dict[Setting, TkambError] = {}
-        self._before: dict[Setting, FrameContact] = {}
+        self._before: dict[Setting, FrameStart] = {}
         self._computing, self._counting, self._latest = Lock(), Lock(), 0
 
     def models(self) -> tuple[str, ...]:
@@ -207,7 +206,7 @@ class LiveKnee:
         """
         key = setting(request)
         with self._counting:
-            if key in self._sides:
+            if key in self._recordings:
                 return ""
             if key in self._refused:
                 raise self._refused.pop(key)
@@ -223,7 +222,7 @@ class LiveKnee:
     def _prepare(self, request: BenchRequest, key: Setting) -> None:
         problem: TkambError | None = None
         try:
-            self._side(request)
+            self._recording(request)
         except TkambError as error:
             problem = error
         except Exception as error:  # the last handler of this thread: the page shows the error
@@ -281,7 +280,9 @@ class LiveKnee:
         return folder / "scene.toml"
 
     def _still_case(self, request: BenchRequest) -> Case:
-        height = self._side(request).state.pair.first_touch_height
+        contact = self._recording(request).knee.contact
+        assert contact is not None  # a case on the bench has contact
+        height = contact.state.pair.first_touch_height
         return self.bench.case_of(request, height, self._case_with(request.thickness_mm))
 
     def _case_with(self, thickness_mm: float | None) -> Case:
@@ -301,40 +302,41 @@ class LiveKnee:
             )
         return self._cases[thickness_mm]
 
-    def _side(self, request: BenchRequest) -> ContactSide:
+    def _recording(self, request: BenchRequest) -> Recording:
         """Return the prepared contact model of a request, shared by all requests of its setting."""
         key, insert = setting(request), request.thickness_mm
         with self._counting:
-            side = self._sides.get(key)
-        if side is None:
+            recording = self._recordings.get(key)
+        if recording is None:
             case = self.bench.case_of(request, like=self._case_with(insert))
-            mechanics = mechanics_of(case, self._shared.get(insert), near=True)
-            side = contact_side(case, mechanics)
+            recording = recording_of(case, self._shared.get(insert), near=True)
+            recording.method.prepare()
         with self._counting:
             if insert not in self._shared:
-                contact = side.mechanics.knee.contact
+                contact = recording.knee.contact
                 assert contact is not None  # a case on the bench has contact
                 self._shared[insert] = SharedState(contact.pair, None, None, range(ROWS))
-            self._sides.pop(key, None)
-            self._sides[key] = side  # the order of use: the latest is last
+            self._recordings.pop(key, None)
+            self._recordings[key] = recording  # the order of use: the latest is last
             self._forget()
-        return side
+        return recording
 
     def _forget(self) -> None:
         """Delete the least recently used models, and the inserts that only these models need."""
-        for old in [*self._sides][: -BENCH_LIMIT.kept_models]:
-            del self._sides[old]
+        for old in [*self._recordings][: -BENCH_LIMIT.kept_models]:
+            del self._recordings[old]
             self._before.pop(old, None)
         for old in [*self._refused][: -BENCH_LIMIT.kept_models]:
             del self._refused[old]
-        needed = {thickness for _, _, thickness in (*self._sides, *self._threads)}
+        needed = {thickness for _, _, thickness in (*self._recordings, *self._threads)}
         for inserts in (self._cases, self._shared):
             for thickness in inserts.keys() - needed:
                 del inserts[thickness]
 
     def _compute(self, request: BenchRequest) -> LiveAnswer:
-        prepared = self._side(request)
-        state = prepared.state
+        ready = self._recording(request).knee.contact
+        assert ready is not None
+        state = ready.state
         zeros = np.zeros(len(state.points))
         empty = LiveAnswer(
             request, {}, "", np.full((4, 4), np.nan), state.points, state.triangles, zeros,
@@ -346,28 +348,28 @@ class LiveKnee:
             return replace(empty, status=words)
         key = setting(request)
         try:
-            ready, shared = prepared.mechanics.knee.contact, self._shared[request.thickness_mm]
-            mechanics = mechanics_of(case, shared, near=True, contact=ready)
-            side = contact_side(case, mechanics, sensitivity=False)
+            shared = self._shared[request.thickness_mm]
+            recording = recording_of(
+                case, shared, near=True, contact=ready, split_sensitivity=False
+            )
             before = [self._before[key]] if key in self._before and not request.released else []
-            body, contact = side.frame(0, before)
+            frame = recording.frame(0, before)
         except TkambError as error:
             return replace(empty, status=f"failed: {error.what}")
-        if contact.result is None:
-            return replace(empty, status=f"failed: {contact.problem}")
+        result = frame.contact
+        if result is None:
+            return replace(empty, status=f"failed: {frame.problem}")
         if not request.released:
-            self._before[key] = contact
-        result = contact.result
-        poses = {link: body.geometry.state.pose(link) for link in ("femur", "tibia")}
-        if contact.equilibrium is None:
+            self._before[key] = frame.next
+        poses = {link: frame.geometry.state.pose(link) for link in ("femur", "tibia")}
+        if frame.equilibrium is None:
             lifted = result.pose @ np.linalg.inv(knee_pose(case.motion.coordinates[0]))
             poses["femur"] = lifted @ poses["femur"]
-        ends = {one.name: np.stack(one.ends(poses)) for one in mechanics.ligaments}
-        flags = [*contact.flags]
+        ends = {one.name: np.stack(one.ends(poses)) for one in recording.ligaments}
         return LiveAnswer(
             request,
-            _numbers(body, contact, mechanics, ends),
-            "; ".join(flags) or "ok",
+            _numbers(frame, recording, ends),
+            "; ".join(frame.flags) or "ok",
             result.pose,
             state.points,
             state.triangles,
@@ -393,14 +395,12 @@ class LiveKnee:
         return as_json(known_error(request.contact, request.resolution_mm, material, options))
 
 
-def _numbers(
-    body: FrameLoads, contact: FrameContact, mechanics: Mechanics, ends: dict[str, Array]
-) -> dict[str, float]:
+def _numbers(frame: Frame, recording: Recording, ends: dict[str, Array]) -> dict[str, float]:
     """Return name -> number. Numbers that results.csv also has use its column names."""
-    result = contact.result
+    result = frame.contact
     assert result is not None
     numbers = {
-        "force_si_N": float(body.loads.contact_force[1]),
+        "force_si_N": float(frame.loads.contact_force[1]),
         "approach_mm": result.approach / MILLIMETRE,
     }
     for side in SIDES:
@@ -415,14 +415,14 @@ def _numbers(
             f"{side}_cop_ap_mm": float(condyle.centre_of_pressure[0]) / MILLIMETRE,
             f"{side}_cop_ml_mm": float(condyle.centre_of_pressure[2]) / MILLIMETRE,
         }
-    for name, tension in body.geometry.tensions.items():
+    for name, tension in frame.geometry.tensions.items():
         numbers[f"ligament_{name}_N"] = tension
-    for bundle in mechanics.ligaments:
+    for bundle in recording.ligaments:
         proximal, distal = ends[bundle.name]
         strain = bundle.strain(np.linalg.norm(distal - proximal))
         numbers[f"ligament_{bundle.name}_strain_percent"] = 100.0 * float(strain)
-    if contact.equilibrium is not None:
-        places = contact.equilibrium.coordinates
+    if frame.equilibrium is not None:
+        places = frame.equilibrium.coordinates
         for name, value in zip(KNEE_COORDINATES, places, strict=True):
             length = name in KNEE_COORDINATES[:3]
             unit = "mm" if length else "deg"

@@ -13,11 +13,12 @@ from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import Case, load_case
 from tkamb.knee.contact_points import CondylePoint
 from tkamb.knee.equations import KneeGeometry
+from tkamb.knee.frame import FrameStart
 from tkamb.knee.patella import touching_patella
 from tkamb.run.identity import RUN_AGAIN, case_of_results, same_files, scene_hash
-from tkamb.run.mechanics import Mechanics
 from tkamb.run.metrics import map_rows
-from tkamb.run.read_scene import contact_side, mechanics_of
+from tkamb.run.read_scene import recording_of
+from tkamb.run.recording import Recording
 from tkamb.run.results import Results
 from tkamb.run.results_folder import SUMMARY_NAME, read_results
 from tkamb.run.simulation import simulate
@@ -31,13 +32,13 @@ class CaseResults:
 
     Args:
         case: content of the scene and its files.
-        mechanics: multibody model of the case, which gives the geometry of the drawing.
+        recording: knee and motion of the case, which give the geometry of the drawing.
         results: results of the case.
         frames: index of the motion's frame for each row of the results.
     """
 
     case: Case
-    mechanics: Mechanics
+    recording: Recording
     results: Results
     frames: tuple[int, ...]
 
@@ -52,14 +53,11 @@ class CaseResults:
         if contact is None or (contact.coupling == "none" and not contact.released):
             rows = map_rows(self.results)
             return [self._geometry(k, rows.get(row)) for row, k in enumerate(progress(self.frames))]
-        from tkamb.knee.frame_contact import FrameContact
-
-        side, result = contact_side(self.case, self.mechanics), list[KneeGeometry]()
-        touched: list[FrameContact] = []
+        result, before = list[KneeGeometry](), list[FrameStart]()
         for k in progress(self.frames):
-            body, contact_of_frame = side.frame(k, touched)
-            result.append(body.geometry)
-            touched.append(contact_of_frame)
+            frame = self.recording.frame(k, before)
+            result.append(frame.geometry)
+            before.append(frame.next)
         return result
 
     def _geometry(self, k: int, row: int | None) -> KneeGeometry:
@@ -69,10 +67,10 @@ class CaseResults:
             k: frame of the motion.
             row: row of the frame's pressure map; None: the frame has no map.
         """
-        maps, mechanics = self.results.maps, self.mechanics
-        if maps is None or row is None or mechanics.muscles is not None:
-            return mechanics.frame(k).geometry
-        instant = mechanics.instant(k)
+        maps, recording = self.results.maps, self.recording
+        if maps is None or row is None or recording.muscles is not None:
+            return recording.loads(k).geometry
+        instant = recording.instant(k)
         points, normals = maps.contact_points_m[row], maps.contact_normals[row]
         condyles = {
             side: CondylePoint(point, normal, instant.sliding(instant.coordinates, point), np.nan)
@@ -80,10 +78,10 @@ class CaseResults:
             if np.isfinite(point).all()
         }
         if not condyles:
-            return mechanics.frame(k).geometry
+            return recording.loads(k).geometry
         patella = None
-        if mechanics.extensor is not None and np.isfinite(points[2]).all():
-            patella = touching_patella(mechanics.extensor.joints(k)[0], points[2], normals[2])
+        if recording.extensor is not None and np.isfinite(points[2]).all():
+            patella = touching_patella(recording.extensor.joints(k)[0], points[2], normals[2])
         return replace(instant.geometry(patella=patella), condyles=condyles)
 
 
@@ -209,7 +207,7 @@ def match_frames(case: Case, results: Results) -> CaseResults:
         raise InputError(
             f"no frame at {error.args[0]} s in the scene's motion", "results", RUN_AGAIN
         ) from None
-    return CaseResults(case, mechanics_of(case, near=True), results, frames)
+    return CaseResults(case, recording_of(case, near=True), results, frames)
 
 
 def run_of_results(results: Results) -> CaseResults:

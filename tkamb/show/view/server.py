@@ -10,7 +10,7 @@ import json
 import secrets
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Lock
@@ -20,9 +20,8 @@ import numpy as np
 
 from tkamb.contact.registry import contact_model, contact_names
 from tkamb.errors import InputError, TkambError
-from tkamb.run.contact_side import ContactSide
 from tkamb.run.guard import say, unforeseen_words
-from tkamb.run.read_scene import contact_side
+from tkamb.run.recording import Recording
 from tkamb.show.style import SIDE_COLOURS
 from tkamb.show.view.draw import lattice_lines
 from tkamb.show.view.drawing import PressureMap
@@ -81,7 +80,7 @@ class ContactSwitch:
     def __init__(self, run: CaseResults, peak: float) -> None:
         self.run, self.peak = run, peak
         self.stage = ""
-        self._sides: dict[str, ContactSide] = {}
+        self._recordings: dict[str, Recording] = {}
         self._lock, self._counting, self._latest = Lock(), Lock(), 0
 
     def models(self) -> tuple[str, ...]:
@@ -105,9 +104,9 @@ class ContactSwitch:
         with self._lock:
             try:
                 self._go_on(number, f"preparing {model}")
-                side = self._side(model)
+                recording = self._recording(model)
                 self._go_on(number, f"computing frame {row} with {model}")
-                return self._compute(side, row, model)
+                return self._compute(recording, row, model)
             finally:
                 self.stage = ""
 
@@ -131,13 +130,14 @@ class ContactSwitch:
         with self._lock:
             return packed_lattice(lattice_lines(self.run.case))
 
-    def _compute(self, side: ContactSide, row: int, model: str) -> bytes:
-        _, contact = side.frame(self.run.frames[row])
-        points, triangles = side.state.points, side.state.triangles
-        result = contact.result
+    def _compute(self, recording: Recording, row: int, model: str) -> bytes:
+        frame, contact = recording.frame(self.run.frames[row]), recording.knee.contact
+        assert contact is not None
+        points, triangles = contact.state.points, contact.state.triangles
+        result = frame.contact
         if result is None:
             no_pressure = PressureMap(points, triangles, *np.zeros((2, 1, len(points))))
-            return packed_map(no_pressure, self.peak, f"{model}: {contact.problem}")
+            return packed_map(no_pressure, self.peak, f"{model}: {frame.problem}")
         pressure_map = PressureMap(
             points, triangles, result.pressure[None] / MEGAPASCAL, result.gap[None]
         )
@@ -149,25 +149,22 @@ class ContactSwitch:
                     f"{name} {condyle.force:.0f} N on {condyle.area / MILLIMETRE**2:.0f} mm², "
                     f"peak {condyle.peak_pressure / MEGAPASCAL:.1f} MPa"
                 )
-        words = [f"{model}: {'; '.join(parts)}", f"{contact.seconds:.2f} s", *contact.flags]
+        words = [f"{model}: {'; '.join(parts)}", f"{frame.contact_seconds:.2f} s", *frame.flags]
         if pressure_map.peak > self.peak:
             words.append(f"the map exceeds the colour scale ({self.peak:.1f} MPa)")
         return packed_map(pressure_map, self.peak, "; ".join(words))
 
-    def _side(self, model: str) -> ContactSide:
-        if model not in self._sides:
-            case = self.run.case
-            assert case.scene.contact is not None
-            same_model = model == case.scene.contact.model
-            changes = {"model": model} if same_model else {"model": model, "options": {}}
-            table = case.scene.contact.model_copy(update=changes)
-            case = replace(case, scene=case.scene.model_copy(update={"contact": table}))
-            other = contact_model(
-                table.model, resolution=table.resolution_mm * MILLIMETRE, **table.options
-            )
-            mechanics = self.run.mechanics.with_contact(other)
-            self._sides[model] = contact_side(case, mechanics)
-        return self._sides[model]
+    def _recording(self, model: str) -> Recording:
+        if model not in self._recordings:
+            table = self.run.case.scene.contact
+            assert table is not None
+            options = table.options if model == table.model else {}
+            spacing = table.resolution_mm * MILLIMETRE
+            other = contact_model(model, resolution=spacing, **options)
+            recording = self.run.recording.with_contact(other)
+            recording.method.prepare()
+            self._recordings[model] = recording
+        return self._recordings[model]
 
 
 class NotYet(TkambError):

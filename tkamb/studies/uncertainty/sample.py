@@ -31,15 +31,14 @@ from tkamb.io.recordings.markers import fit_seen
 from tkamb.io.recordings.recording_tables import MarkerSegmentTable
 from tkamb.io.scene import Scene
 from tkamb.io.scene.case import Case, load_case
-from tkamb.knee.frame_contact import FrameContact
+from tkamb.knee.frame import FrameStart
 from tkamb.knee.ligaments import Ligament
 from tkamb.knee.load import LinkPoint
 from tkamb.knee.muscles import Muscle, SagittalWrap
-from tkamb.run.contact_side import ContactSide
-from tkamb.run.mechanics import Mechanics
 from tkamb.run.muscles.shared_muscles import SharedMuscles
-from tkamb.run.read_scene import SharedState, contact_side, mechanics_of
-from tkamb.run.status import failures_of, frame_status
+from tkamb.run.read_scene import SharedState, recording_of
+from tkamb.run.recording import Recording
+from tkamb.run.status import frame_status
 from tkamb.run.tabulate import frame_row
 from tkamb.studies.uncertainty.inputs import (
     COP_AXES,
@@ -314,9 +313,8 @@ class Sampler:
             uncertainty_of(self.case).correlation, [varied.name for varied in self.inputs]
         )
         self._split = self.case.split
-        self._mechanics = mechanics_of(self.case)
-        contact = self.case.scene.contact
-        self._side = contact_side(self.case, self._mechanics) if contact else None
+        self._recording = recording_of(self.case)
+        self._recording.method.prepare()
 
     def draw(self, point: Point) -> Draw:
         """Return the errors of the inputs at a point."""
@@ -343,27 +341,29 @@ class Sampler:
         values = np.full((len(self.names), len(self._frames)), np.nan)
         try:
             case = self._varied(draw)
-            contact = self._mechanics.knee.contact
+            nominal = self._recording.method
+            contact, cam = nominal.knee.contact, nominal.cam
             if contact is not None:
                 table = case.scene.contact
                 assert table is not None
                 contact = contact.changed(table.friction, draw.factor("young_modulus"))
-            mechanics, side = mechanics_of(case, self._shared(draw), contact=contact), None
-            if self._side is not None:
-                side = contact_side(case, mechanics, sensitivity=False, post=self._side.post)
+            recording = recording_of(
+                case, self._shared(draw), contact=contact, split_sensitivity=False, cam=cam
+            )
+            recording.method.prepare()
         except TkambError as error:  # the varied inputs are invalid, so every frame fails
             return Sample(values, np.full(len(self._frames), str(error)), errors)
         problems: list[str] = []
-        before: list[FrameContact] = []
+        before: list[FrameStart] = []
         for column, k in enumerate(self._frames):
-            row, problem = _frame(case, mechanics, side, k, before)
+            row, problem = _frame(case, recording, k, before)
             problems.append(problem)
             if not problem:
                 values[:, column] = [row.get(name, np.nan) for name in self.names]
         return Sample(values, np.array(problems), errors)
 
     def _shared(self, draw: Draw) -> SharedState:
-        nominal = self._mechanics
+        nominal = self._recording
         muscles, contact = varied_muscles(nominal.muscles, draw), nominal.knee.contact
         pair = None if contact is None else contact.pair
         return SharedState(pair, muscles, nominal.extensor, self._frames)
@@ -397,22 +397,14 @@ class BandWorker:
 
 
 def _frame(
-    case: Case,
-    mechanics: Mechanics,
-    side: ContactSide | None,
-    k: int,
-    before: list[FrameContact],
+    case: Case, recording: Recording, k: int, before: list[FrameStart]
 ) -> tuple[dict[str, Any], str]:
     """Return the row of frame k in results.csv, and the reason if it failed.
 
-    `before` holds the contacts of the last two frames and is updated.
+    `before` holds the starts of the last two frames and is updated.
     """
-    contact = None
-    if side is None:
-        body = mechanics.frame(k)
-    else:
-        body, contact = side.frame(k, before)
-        before.append(contact)
-        del before[:-2]
-    row = frame_row(case, k, body, contact, {}, frame_status(case, k, body, contact))
-    return row, "; ".join(failures_of(body, contact))
+    frame = recording.frame(k, before)
+    before.append(frame.next)
+    del before[:-2]
+    row = frame_row(case, k, frame, {}, frame_status(case, k, frame))
+    return row, "; ".join(frame.failures)
