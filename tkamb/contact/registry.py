@@ -8,6 +8,7 @@ group `tkamb.contact`:
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -103,6 +104,25 @@ def contact_model(
             raise InputError(f"option '{option}' cannot be {value!r}", where, advice)
         _check_kind(cls, option, value, where)
     return cls(resolution=resolution, **options)  # type: ignore[call-arg]
+
+
+def contact_model_in_mm(
+    name: str, resolution_mm: float, options: Mapping[str, Any]
+) -> ContactModel:
+    """Return the contact model of a scene or command, which states the spacing in mm.
+
+    Args:
+        name: one of `contact_names()`.
+        resolution_mm: spacing of the map points, mm.
+        options: other options of the model.
+
+    Raises:
+        InputError: as for `contact_model`, or the options state the resolution again.
+    """
+    if "resolution" in options:
+        where = f"contact model '{name}'"
+        raise InputError("resolution and resolution_mm are both given", where, "give one of them")
+    return contact_model(name, resolution=resolution_mm * MILLIMETRE, **options)
 
 
 def contact_options(name: str) -> tuple[str, ...]:

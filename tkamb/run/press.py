@@ -15,7 +15,7 @@ from tkamb.contact.materials import Material
 from tkamb.contact.model import ContactModel
 from tkamb.contact.pair import Bearing, ContactPair
 from tkamb.contact.pressing import check_load
-from tkamb.contact.registry import contact_model
+from tkamb.contact.registry import contact_model_in_mm
 from tkamb.contact.result import CondyleContact, ContactResult, ContactStatus
 from tkamb.errors import InputError
 from tkamb.files import read_text
@@ -322,7 +322,7 @@ def press_meshes(
     """
     _check_load(load)
     settings = _adjustment_settings(adjust, restore_when)
-    model = contact_model(contact, resolution=resolution_mm * MILLIMETRE, **(options or {}))
+    model = contact_model_in_mm(contact, resolution_mm, options or {})
     pair, femoral_pose = load_pair(femoral, insert, units, pose, bearing, material, axes, side)
     if not math.isfinite(pair.first_touch_height(femoral_pose)):
         raise InputError(

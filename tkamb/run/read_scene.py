@@ -166,7 +166,7 @@ def _knee(case: Case, shared: SharedState | None, contact: "KneeContact | None")
     friction = 0.0 if table is None else table.friction
     if table is not None and contact is None:
         from tkamb.contact.pair import ContactPair
-        from tkamb.contact.registry import contact_model
+        from tkamb.contact.registry import contact_model_in_mm
         from tkamb.io.given_material import given_material
         from tkamb.knee.contact import KneeContact
 
@@ -176,9 +176,7 @@ def _knee(case: Case, shared: SharedState | None, contact: "KneeContact | None")
             material = given_material(scene.insert_material)
             pair = ContactPair(case.femoral, case.insert, material, insert.bearing)
             pair.__dict__["split"] = case.split  # computed once for case and pair
-        model = contact_model(
-            table.model, resolution=table.resolution_mm * MILLIMETRE, **table.options
-        )
+        model = contact_model_in_mm(table.model, table.resolution_mm, table.options)
         contact = KneeContact(model, pair, friction)
     if contact is not None:
         pair = contact.pair

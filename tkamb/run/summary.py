@@ -176,9 +176,9 @@ def _tolerances(table: ContactTable) -> dict[str, float]:
     if table.model not in ("lattice", "lattice-linear", "fe"):
         return {}
     from tkamb.contact.lattice.model import CellContact
-    from tkamb.contact.registry import contact_model
+    from tkamb.contact.registry import contact_model_in_mm
 
-    model = contact_model(table.model, resolution=table.resolution_mm * MILLIMETRE, **table.options)
+    model = contact_model_in_mm(table.model, table.resolution_mm, table.options)
     assert isinstance(model, CellContact)
     settings = model.settings
     return {"force": settings.force_tolerance, "gap": settings.gap_tolerance}

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.contact.registry import contact_model
+from tkamb.contact.registry import contact_model_in_mm
 from tkamb.geometry.frames import KNEE_COORDINATES, Array
 from tkamb.geometry.surface import Surface
 from tkamb.io.given_material import (
@@ -327,11 +327,7 @@ def check_scene(
     begin("reading the scene and its files")
     scene = load_scene(path, overrides)
     if scene.contact:
-        contact_model(
-            scene.contact.model,
-            resolution=scene.contact.resolution_mm * MILLIMETRE,
-            **scene.contact.options,
-        )
+        contact_model_in_mm(scene.contact.model, scene.contact.resolution_mm, scene.contact.options)
         given_material(scene.insert_material)
     case = load_case(scene)
     begin("placing leg, patella and muscles")

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import ValidationError
 
-from tkamb.contact.registry import contact_model, contact_options
+from tkamb.contact.registry import contact_model_in_mm, contact_options
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, knee_pose
 from tkamb.io.given_material import given_material
@@ -347,7 +347,7 @@ def _engine(case: Case, table: ContactTable) -> ContactEngine:
     options = dict(table.options)
     if "cache" in contact_options(table.model):
         options["cache"] = False  # each update of the geometry needs another operator
-    model = contact_model(table.model, resolution=table.resolution_mm * MILLIMETRE, **options)
+    model = contact_model_in_mm(table.model, table.resolution_mm, options)
     return ContactEngine(
         model, case.femoral, given_material(case.scene.insert_material), insert.bearing
     )
