@@ -54,10 +54,14 @@ class Page:
         return self
 
     def wait(self, ready):
-        """Wait until a JavaScript expression is true."""
+        """Wait until a JavaScript expression is true. After five minutes, fail and name it."""
         self.evaluate(
-            "new Promise((done) => { const t = setInterval(() => {"
-            f"if ({ready}) {{ clearInterval(t); done(true); }} }}, 20); }})"
+            "(ready) => new Promise((done, fail) => { let rounds = 0; const t = setInterval(() => {"
+            f"if ({ready}) {{ clearInterval(t); done(true); }}"
+            "else if (++rounds > 15000) "
+            "{ clearInterval(t); fail(new Error('never true: ' + ready)); }"
+            "}, 20); })",
+            ready,
         )
 
     def forgive(self, words):
@@ -74,6 +78,7 @@ class Page:
 
     def resize(self, width, height):
         """Set the size of the window, px, and wait until the page has drawn it."""
+        self._page.bring_to_front()  # a page behind another one is not drawn
         self._page.set_viewport_size({"width": width, "height": height})
         self.evaluate("new Promise((done) => requestAnimationFrame(() => setTimeout(done, 50)))")
 

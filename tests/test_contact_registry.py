@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from scenes import write_scene
+from tkamb import named_classes
 from tkamb.cli import main
-from tkamb.contact import named_classes
 from tkamb.contact.foundation import ElasticFoundation
 from tkamb.contact.registry import (
     BUILT_IN,

@@ -53,7 +53,9 @@ def test_the_exact_tangent_is_the_derivative_of_the_wrench(name, monkeypatch):
     for module in (lattice_model, compliance):
         monkeypatch.setattr(module, "SINGLE", np.float64)
     newton = name != "lattice-linear"
-    model = replace(contact_model(name, resolution=3e-3), tolerance=1e-9, newton=newton, cache=False)
+    model = replace(
+        contact_model(name, resolution=3e-3), tolerance=1e-9, newton=newton, cache=False
+    )
     state = model.prepare(pair(condyles(), dished_insert(), material("polyethylene")))
     result, start = model.press_from(state, 800.0, above(x=0.5e-3, y=0.03))
     probe = model.probe(state, start)

@@ -1,4 +1,7 @@
-"""A run opens only the files and imports only the modules that its scene needs."""
+"""A run reads only the files and imports only the modules that its scene needs.
+
+The contents of all files that the scene names are hashed.
+"""
 
 import json
 import subprocess

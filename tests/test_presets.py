@@ -8,9 +8,8 @@ from types import SimpleNamespace
 import pytest
 
 from scenes import write_scene
-from tkamb import load_scene, simulate
+from tkamb import load_scene, named_classes, simulate
 from tkamb.cli import main
-from tkamb.contact import named_classes
 from tkamb.errors import InputError
 from tkamb.io.presets import PRESETS, Preset, find_preset
 from tkamb.io.scene import with_preset

@@ -13,8 +13,8 @@ from dataclasses import fields
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from tkamb.contact.model import ContactModel
-from tkamb.contact.named_classes import NamedClasses
 from tkamb.errors import InputError, names_near
+from tkamb.named_classes import NamedClasses
 from tkamb.units import MILLIMETRE
 
 # m: largest accepted spacing. Chosen because a condyle's contact is 5 to 20 mm across, and a

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, ClassVar
 
-from tkamb.contact.named_classes import NamedClasses
 from tkamb.errors import InputError
+from tkamb.named_classes import NamedClasses
 
 MODEL, OPTIONS = "contact.model", "contact.options"
 """Keys of the contact model and of its options."""

@@ -27,9 +27,9 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tkamb.contact.named_classes import NamedClasses
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
+from tkamb.named_classes import NamedClasses
 
 # 1: eps1 of every ligament. The toe region ends at twice this strain. Source: Blankevoort &
 # Huiskes (1991).

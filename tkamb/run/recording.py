@@ -5,7 +5,6 @@ takes its initial guess from them (`Recording.recalled`). They do not include th
 the lattice: a resumed run differs from a single one within the tolerance of the solver.
 """
 
-import copy
 import time as clock
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -111,9 +110,10 @@ class Recording:
 
     def with_contact(self, model: "ContactModel") -> "Recording":
         """Return the same recording with another contact model."""
-        other = copy.copy(self)
-        other.method = self.method.of(self.knee.with_contact(model))
-        return other
+        method = self.method.of(self.knee.with_contact(model))
+        return Recording(
+            method, self.motion, self.ground, self.extensor, self.muscles, self.strains
+        )
 
     def instant(self, k: int) -> Instant:
         """Return the knee at frame k."""

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from tkamb.contact.registry import contact_model, contact_names
+from tkamb.contact.registry import contact_model_in_mm, contact_names
 from tkamb.errors import InputError, TkambError
 from tkamb.run.guard import say, unforeseen_words
 from tkamb.run.recording import Recording
@@ -152,8 +152,7 @@ class ContactSwitch:
             table = self.run.case.scene.contact
             assert table is not None
             options = table.options if model == table.model else {}
-            spacing = table.resolution_mm * MILLIMETRE
-            other = contact_model(model, resolution=spacing, **options)
+            other = contact_model_in_mm(model, table.resolution_mm, options)
             recording = self.run.recording.with_contact(other)
             recording.method.prepare()
             self._recordings[model] = recording

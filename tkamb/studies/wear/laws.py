@@ -17,9 +17,9 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
-from tkamb.contact.named_classes import NamedClasses
 from tkamb.errors import InputError, names_near
 from tkamb.geometry.frames import Array
+from tkamb.named_classes import NamedClasses
 from tkamb.studies.wear.sliding import SlidingHistory
 from tkamb.units import MEGAPASCAL
 
