@@ -91,13 +91,13 @@ class ElasticFoundation(ContactModel):
     law with 32 k d J3(k a)/(k a)³ of the load, with the penetration d, the radius a of the contact
     and k = 2 pi/resolution. For a ball of 25 mm under 500 N this is up to 0.1 % at 1 mm and 0.4 %
     at 2 mm. Where a column crosses an edge of two femoral triangles, its force turns: at 2 mm the
-    force of the shipped knee jumps by 0.004 N (median) to 0.3 N, every 11 µm along AP. A column
-    that meets the femur at less than 6 deg is unloaded. There, and where an outline of the femoral
-    component passes a column of the rim, the energy jumps (`scripts/measure/energy`). If the
-    penetration is at least half of the thickness, along y or along the normal, the result is
-    OUT_OF_RANGE. Walls parallel to y carry no load. A mobile bearing is pressed like a fixed one.
-    The approach counts from the first touch of the triangles; the smooth surface lies outside them
-    by up to their sagitta.
+    force of the shipped knee jumps by 0.004 N (median of 57 crossings; the largest 0.3 N), every 11
+    µm along AP. A column that meets the femur at less than 6 deg is unloaded. There, and where an
+    outline of the femoral component passes a column of the rim, the energy jumps
+    (`scripts/measure/energy`). If the penetration is at least half of the thickness, along y or
+    along the normal, the result is OUT_OF_RANGE. Walls parallel to y carry no load. A mobile
+    bearing is pressed like a fixed one. The approach counts from the first touch of the triangles;
+    the smooth surface lies outside them by up to their sagitta.
 
     Args:
         resolution: m, spacing of the map points.

@@ -4,8 +4,9 @@ Some meshes are flat subdivisions: every edge of a coarser mesh was halved witho
 shape. Then only the coarser triangles show the curvature. `coarsened` finds them.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -13,8 +14,10 @@ from scipy.sparse.csgraph import connected_components
 
 from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.frames import Array, Index
-from tkamb.geometry.surface import Surface
 from tkamb.geometry.topology import Ragged, edge_use
+
+if TYPE_CHECKING:
+    from tkamb.geometry.surface import Surface
 
 # 1: largest distance of a vertex from the middle of a coarser edge, as a share of the surface's
 # size. Chosen because files round coordinates by less.
@@ -37,12 +40,12 @@ class Coarsened:
         corners: (k, 3, 3) barycentric coordinates, on the parent, of each finer triangle's corners.
     """
 
-    surface: Surface
+    surface: "Surface"
     parent: Index
     corners: Array
 
 
-def coarsened(surface: Surface) -> Coarsened | None:
+def coarsened(surface: "Surface") -> Coarsened | None:
     """Return the coarsest surface that subdivides flatly into this one; None if there is none.
 
     Each connected part is examined separately. Its subdivision is undone as a whole or not at all.
@@ -60,7 +63,7 @@ def coarsened(surface: Surface) -> Coarsened | None:
     return coarse
 
 
-def _coarsened_once(surface: Surface) -> Coarsened | None:
+def _coarsened_once(surface: "Surface") -> Coarsened | None:
     faces = surface.faces
     across = _across(faces)
     count, part = _parts(across)
@@ -82,7 +85,7 @@ def _coarsened_once(surface: Surface) -> Coarsened | None:
     at_tip = faces[:, :, None] == tips[parent][:, None]
     at_half = faces[:, :, None] == halves[parent][:, None]
     corners = at_tip + 0.5 * (at_half.any(axis=2, keepdims=True) & ~at_half)
-    return Coarsened(Surface(surface.vertices, tips, surface.name), parent, corners)
+    return Coarsened(replace(surface, faces=tips, merged=False), parent, corners)
 
 
 class _Search:
@@ -93,7 +96,7 @@ class _Search:
     ones across the neighbours' tips.
     """
 
-    def __init__(self, surface: Surface, across: Index) -> None:
+    def __init__(self, surface: "Surface", across: Index) -> None:
         self._faces, self._points, self._across = surface.faces, surface.vertices, across
         self._near = HALVING_TOLERANCE * float(np.linalg.norm(np.ptp(surface.bounds, axis=0)))
         self._corners = Ragged.by_key(surface.faces.ravel(), len(surface.vertices))
@@ -203,13 +206,13 @@ class CurvedSurface:
         idea of patches from corner normals).
     """
 
-    surface: Surface
+    surface: "Surface"
     normals: Array
     sagittas: Array
     finer: Coarsened | None = None
 
     @classmethod
-    def of(cls, surface: Surface) -> "CurvedSurface":
+    def of(cls, surface: "Surface") -> "CurvedSurface":
         """Return the patches of a surface from its corner normals."""
         finer = coarsened(surface)
         surface = surface if finer is None else finer.surface
@@ -352,7 +355,7 @@ def _shifts(patches: Array, faces: Index, weights: Array, direction: Array) -> t
     return shifts, normals
 
 
-def _sagittas(surface: Surface, normals: Array) -> Array:
+def _sagittas(surface: "Surface", normals: Array) -> Array:
     """Return the sagittas (k, 3), m, of the edges opposite each corner."""
     corners = surface.triangles
     lean = np.einsum("kij,kj->ki", normals, surface.face_normals)
