@@ -40,8 +40,9 @@ STAGNATION_TOLERANCE = 1e-5
 # Maximum number of evaluations of the residual. Not studied.
 MAX_NEWTON_STEPS = 40
 # 1: Newton's step is halved while the slope of the energy at its end exceeds this share of its size
-# at the beginning, see above. Measured: 80 steps of a knee simulator take 168 evaluations with
-# shares of 0.5 and 0.9, 175 with 0.1.
+# at the beginning, see above. Measured on a knee simulator with steps of 10 ms: 80 steps take 168
+# evaluations with shares of 0.5 and 0.9, 175 with 0.1. From 40 random starts all runs converge;
+# without the halving 24 do not.
 LARGEST_RISE = 0.5
 
 
