@@ -1,9 +1,9 @@
 """Taut paths of ligament bundles over surfaces, and their pulls on the links.
 
 Let L be the length of the shortest path over the surfaces (`tkamb.knee.taut_strings`), and T its
-tension. No friction acts, so that T is constant along the path. The wrench on a link is -T dL/dx for
-a displacement x of this link: the tension pulls along the straight parts at their ends and presses
-on a surface where the path meets and leaves it. The sum of all wrenches is zero.
+tension. No friction acts, so that T is constant along the path. The wrench on a link is -T dL/dx
+for a displacement x of this link: the tension pulls along the straight parts at their ends and
+presses on a surface where the path meets and leaves it. The sum of all wrenches is zero.
 
 If an end of the path moves into an ellipsoid, the ellipsoid shrinks with this end, so that L is
 continuous. There is no path if an end lies inside a cylinder, a sphere or a section.
