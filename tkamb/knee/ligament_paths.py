@@ -59,7 +59,8 @@ def bundle_paths(bundle: "Ligament", poses: Mapping[str, Array]) -> BundlePaths:
     strings = strings_over(
         wraps,
         objects,
-        *ends,
+        ends[0],
+        ends[1],
         np.tile([wrap.active for wrap in wraps], (len(rows), 1)),
         np.ones((len(rows), count, 2), bool),
     )

@@ -180,7 +180,7 @@ class BundleArrays:
         )
 
     def pulls(self, proximal: Array, distal: Array) -> tuple[Array, Array]:
-        """Return tensions (..., m), N, and forces (..., m, 3), N, on the straight bundles' distal ends.
+        """Return tensions (..., m), N, and forces (..., m, 3), N, on distal ends.
 
         Args:
             proximal: proximal ends, shape (..., m, 3), m.
@@ -263,12 +263,13 @@ def ligament_loads(
         return _straight_loads(ligaments, poses)
     from tkamb.knee.ligament_paths import taut_wrenches  # imports numba
 
-    tension, loads = np.zeros(len(ligaments)), list[PointForces]()
+    loads: list[PointForces] = []
+    tension = np.zeros(len(ligaments))
     straight = [bundle for bundle in ligaments if not bundle.wraps]
     if straight:
         tension[~wraps], straight_loads = _straight_loads(straight, poses)
         loads += straight_loads
-    for k in np.flatnonzero(wraps):
+    for k in np.flatnonzero(wraps).tolist():
         pull, on_links = taut_wrenches(ligaments[k], poses)
         tension[k] = float(pull)
         for link, wrench in on_links.items():

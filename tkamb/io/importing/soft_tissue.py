@@ -53,12 +53,17 @@ class SoftTissue:
     remarks: tuple[str, ...]
 
 
-def soft_tissue(links: Links) -> SoftTissue:
-    """Return the muscles and ligaments of a leg that the scene can describe."""
+def soft_tissue(links: Links, straight_ligaments: bool = False) -> SoftTissue:
+    """Return the muscles and ligaments of a leg that the scene can describe.
+
+    Args:
+        links: links of the leg.
+        straight_ligaments: whether the surfaces that ligaments wrap are left out.
+    """
     text: list[str] = []
     quadriceps = _quadriceps(links, text)
     ligament, length = _patellar_ligament(links, text)
-    bundles = _bundles(links, text)
+    bundles = _bundles(links, text, straight_ligaments)
     _name_muscles(links, text)
     return SoftTissue(quadriceps, ligament, length, bundles, tuple(text))
 
@@ -128,7 +133,7 @@ def _patellar_ligament(links: Links, remarks: list[str]) -> tuple[tuple[End, End
     return (ends[0], ends[1]), length
 
 
-def _bundles(links: Links, remarks: list[str]) -> tuple[Bundle, ...]:
+def _bundles(links: Links, remarks: list[str], straight: bool) -> tuple[Bundle, ...]:
     leg = links.leg
     bundles: list[Bundle] = []
     omitted: dict[str, list[str]] = {}
@@ -148,7 +153,7 @@ def _bundles(links: Links, remarks: list[str]) -> tuple[Bundle, ...]:
                 _end(tibia[-1]),
                 ligament.stiffness_N,
                 ligament.slack_length_m,
-                _wraps(links, ligament, ignored),
+                () if straight else _wraps(links, ligament, ignored),
             )
         )
     if bundles:
@@ -156,6 +161,7 @@ def _bundles(links: Links, remarks: list[str]) -> tuple[Bundle, ...]:
         remarks.append(
             f"{len(bundles)} femorotibial ligament strands imported, {wrapped} of them over "
             "surfaces of the model, the others as straight lines"
+            + (" (wraps on bone are left out)" if straight else "")
         )
     for reason, names in ignored.items():
         remarks.append(f"surfaces left out, {reason}: {some_names(names)}")

@@ -257,23 +257,19 @@ def wrap_object(
             raise InputError(
                 f"the scene does not read the {table.part}", f"wrap {table.name}", "give [contact]"
             )
-        sizes = table.band_mm * MILLIMETRE, table.offset_mm * MILLIMETRE
         here = mirrored_pose(placed) if left else placed
-        found = mesh_section(table.name, "femur", surface, here, *sizes)
+        band, offset = table.band_mm * MILLIMETRE, table.offset_mm * MILLIMETRE
+        found = mesh_section(table.name, "femur", surface, here, band, offset)
         return found.on("tibia", chain.insert_in_tibia) if table.part == "insert" else found
     assert table.link is not None
-    outline = None
-    sizes = (table.radius_mm,)
-    if table.shape == "cylinder":
-        sizes = table.radius_mm, table.length_mm
-    elif table.shape == "ellipsoid":
-        sizes = table.semi_axes_mm
-    elif table.shape == "section":
-        sizes, corners = (), np.array(table.outline_mm, float) * MILLIMETRE
+    outline: Array | None = None
+    sizes = (table.radius_mm, table.length_mm, *(table.semi_axes_mm or ()))
+    if table.outline_mm is not None:
+        corners = np.array(table.outline_mm, float) * MILLIMETRE
         outline = convex_outline(corners)
         if len(outline) != len(corners):
             raise InputError("outline_mm is not strictly convex", f"wrap {table.name}")
-    dimensions = tuple(float(size) * MILLIMETRE for size in sizes)
+    dimensions = tuple(float(size) * MILLIMETRE for size in sizes if size is not None)
     found = WrapObject(table.name, table.link, table.shape, placed, dimensions, outline=outline)
     return found.mirrored() if left else found
 
