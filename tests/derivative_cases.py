@@ -1,7 +1,9 @@
 """Knees, random states and central differences for derivatives of forces.
 
-Facets, columns and nodes that come into contact, and taut ligaments give the forces kinks. On a
-kink the two one-sided derivatives differ, and a derivative can agree with one of them only.
+Columns and nodes that come into contact, and taut ligaments give the forces kinks. On a kink the
+two one-sided derivatives differ, and a derivative can agree with one of them only. Where a column
+of the foundation crosses an edge of two femoral facets, its force turns by less than a mrad. Only
+steps that end before this jump agree with the derivative.
 """
 
 from collections.abc import Callable, Iterator
@@ -293,7 +295,7 @@ def body_case(read, left):
             q = pressed(plain, q, 1000.0 * rng.uniform(0.5, 1.5))
             yield body.state(q, v, a, external)[:2]
 
-    return Case(body.knee, states, 400.0, (1e-8, 4e-8))
+    return Case(body.knee, states, 400.0)
 
 
 def mimic_case(read):

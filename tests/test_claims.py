@@ -16,7 +16,7 @@ from tkamb.show.axis import horizontal_axis
 from tkamb.show.headline import cards, peak_lines
 from tkamb.show.methods import methods
 from tkamb.show.report import report_html
-from tkamb.show.sections import conclusions, lead
+from tkamb.show.sections import conclusions, lead, motion_table
 from tkamb.show.view.draw import readings
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -129,7 +129,15 @@ def test_every_output_leads_with_the_split_that_the_conclusions_allow(shipped):
         ):
             assert re.search(rf"{side}(?: force:)? {force:.2f}", text)
     supported, unsupported = conclusions(shipped)
-    assert "The share of each condyle, by equilibrium of moments." in supported
+    error = method_error(shipped.summary)
+    errors = [f"{side} {error.rmse(side):.2f}" for side in FORCES[1:]]
+    share = "The share of each condyle, by equilibrium of moments"
+    assert f"{share}, with the errors of squat: {', '.join(errors)} BW (rms)." in supported
+    table = motion_table(shipped, horizontal_axis(shipped))
+    for side in FORCES[1:]:
+        place = table.headings.index((side, "N, equil."))
+        cells = [float(row[place]) for row in table.rows]
+        assert max(cells) == round(peaks[side] * weight)
     assert any(one.startswith("The split by deformation in any frame") for one in unsupported)
     names = [row.name for row in readings(shipped, horizontal_axis(shipped))]
     assert names.index("· by equilibrium") < names.index("· by deformation")

@@ -132,6 +132,12 @@ def test_the_implicit_step_agrees_with_central_differences(action, control):
     step.calc(data, x, u)
     end = np.array(data.xnext)
     assert np.isfinite(end).all()
+    step.calc(data, x + 0.05 * np.eye(8)[7], np.add(u, [20.0, 0, 0, 20.0, 500.0]))
+    step.calc(data, x, u)
+    assert (data.xnext == end).all()  # whatever was computed before
+    step.calc(data, x, np.add(u, [1e5, 0, 0, 0, 0]))  # the first joint would turn many times
+    assert np.isnan(data.xnext).all()
+    step.calc(data, x, u)
     step.calcDiff(data, x, u)
 
     def after(x, u):

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from scipy.special import jv
 
 from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
 from tkamb.contact import samples as contact_samples
@@ -399,6 +400,27 @@ def test_the_work_over_a_closed_loop_vanishes(turning):
     phase = np.array([0.0, 1.3, 2.1, 0.4, 2.9, 1.0])
     centre = np.array([0.0, pressed.pose[1, 3], 0.0, 0.0, 0.0, 0.0])
     assert abs(loop_work(probe, centre, amplitude, phase, 400)) < 1e-5
+
+
+@pytest.mark.parametrize(("cell", "depth"), [(1e-3, 0.2e-3), (0.5e-3, 0.12e-3)])
+def test_the_map_holds_a_ball_on_a_plate_with_the_closed_form(cell, depth):
+    """The sum of the energy over cells of the size s exceeds its integral by waves of length s.
+
+    By Poisson's formula the wave along x is 2 W(k) cos(k x), k = 2 pi/s, with the transform W of
+    the energy M d²/2h, d = depth (1 - r²/a²): W(k) = 8 pi a² M depth² J3(k a)/(h (k a)³). The slope
+    of the wave, by the load F = pi M a² depth/2h, is 32 k depth J3(k a)/(k a)³.
+    """
+    model = LinearFoundation(cell)
+    probe = model.probe(model.prepare(sphere_on_block()))
+    places, wave = cell * np.arange(8) / 8, 2 * np.pi / cell
+    waves, loads = 0.0, 0.0
+    for x in places:
+        for z in places[::2]:
+            ap, si = probe.at(lowered(depth, x, z)).wrench[:2]
+            waves, loads = waves + 2 * ap * np.sin(wave * x), loads + si
+    phase = wave * np.sqrt(2 * RADIUS * depth - depth**2)
+    expected = 32 * wave * depth * jv(3, phase) / phase**3
+    assert -waves / loads == pytest.approx(expected, rel=0.05)
 
 
 def test_the_stiffness_is_the_slope_of_the_wrench():

@@ -77,20 +77,36 @@ def dish(radius, depth=10 * MM, spacing=0.5 * MM):
 
 @pytest.mark.parametrize("share", [0.15, pytest.param(-0.05, marks=pytest.mark.slow)])
 def test_the_normal_of_a_ball_in_a_dish_is_parallel_to_the_resultant(share):
-    """Both bodies are symmetric about the line of centres, so tan(angle) = P/F."""
-    load, radius = 800.0, 40 * MM
+    """tan(angle) = P/F, if both bodies are symmetric about the line of centres.
+
+    The thickness h of the bed is not. Along an arc u of the dish, at the angle t, it grows by
+    u sin(t). The pressure (1 - u²/a²)/h then has its centre at u = -a² sin(t)/(6 h). There the
+    normal of the ball of radius r is turned by u/r. With 1/R = 1/r - 1/radius,
+    F = pi M a⁴/(4 R h).
+    """
+    load, ball_radius, radius = 800.0, 25 * MM, 40 * MM
     applied = [share * load, -load, 0, 0, 0, 0]
     drive = machine(applied, (AP, SI))
-    coordinates, reason = equilibrium(dish(radius), graded_sphere(25 * MM), drive, load, 1.0)
+    coordinates, reason = equilibrium(dish(radius), graded_sphere(ball_radius), drive, load, 0.5)
     assert not reason
-    # the thickness of the bed changes its stiffness by half a per cent over the contact
-    assert coordinates[AP] / (10 * MM + radius - coordinates[SI]) == pytest.approx(share, rel=0.01)
+    angle = np.arctan2(coordinates[AP], 10 * MM + radius - coordinates[SI])
+    thickness = 10 * MM + radius * (1 - np.cos(angle))
+    conformity = 1 / (1 / ball_radius - 1 / radius)
+    stiffness = np.pi * material("polyethylene-linear").confined_modulus
+    square = np.sqrt(4 * load * np.hypot(1, share) * conformity * thickness / stiffness)
+    turn = square * np.sin(angle) / (6 * thickness * ball_radius)
+    assert np.tan(angle - turn) == pytest.approx(share, rel=1e-3)
+
+
+# mm: on a flat plate the map itself holds a ball (test_foundation has the closed form): with 0.3 %
+# of the load at 2 mm, and with 3e-5 at this spacing, which is 0.5 µm of the spring.
+FINE = 0.25
 
 
 @pytest.mark.parametrize(("force", "gap"), [(60.0, 0.0), (-45.0, 0.7 * MM)])
 def test_on_a_flat_plate_the_spring_balances_the_ap_force(force, gap):
     drive = machine([force, -500.0, 0, 0, 0, 0], (AP, SI), {"ap": Spring(30e3, gap)})
-    coordinates, reason = equilibrium(flat_insert(10 * MM), ball(), drive, 500.0)
+    coordinates, reason = equilibrium(flat_insert(10 * MM), ball(), drive, 500.0, FINE)
     assert not reason
     assert coordinates[AP] == pytest.approx(np.sign(force) * (abs(force) / 30e3 + gap), abs=2e-6)
 
@@ -101,7 +117,7 @@ def test_on_a_flat_plate_the_spring_balances_the_axial_torque(torque, gap):
     applied = [0, -900.0, 0, torque, 0, 0]
     drive = machine(applied, (SI, AXIAL_ROTATION), {"axial_rotation": Spring(stiffness, gap)})
     plate = flat_insert(10 * MM, 15 * MM, 34 * MM)
-    coordinates, reason = equilibrium(plate, balls(), drive, 900.0)
+    coordinates, reason = equilibrium(plate, balls(), drive, 900.0, FINE)
     assert not reason
     rotation = np.sign(torque) * (abs(torque) / stiffness + gap)
     assert coordinates[AXIAL_ROTATION] == pytest.approx(rotation, abs=1e-4)

@@ -1,9 +1,11 @@
 """The slack lengths of two ligaments, fitted to a laxity curve by gradient.
 
 A laxity curve is the adduction of a loaded knee against an adduction moment. It is computed here
-with known slack lengths, and the fit has to find them again. `equilibrium(..., derivatives=True)`
-returns the derivative of the adduction by the slack lengths, by the implicit function theorem. The
-same fit by finite differences needs three equilibria for each moment and step.
+with known slack lengths, and the fit has to find them again. Only 150 N press the knee, so that the
+larger moments lift one condyle: until then the curve says little about slack lengths.
+`equilibrium(..., derivatives=True)` returns the derivative of the adduction by the slack lengths,
+by the implicit function theorem. The same fit by finite differences needs three equilibria for each
+moment and step.
 """
 
 import time
@@ -58,7 +60,7 @@ def adductions(slack, derivatives=False):
     found, slopes, q = [], [], start
     for moment in moments:
         fext = pin.StdVec_Force([pin.Force.Zero()] * model.njoints)
-        fext[shank] = pin.Force(np.array([0, 400.0, 0]), np.array([moment, 0, 0]))
+        fext[shank] = pin.Force(np.array([0, 150.0, 0]), np.array([moment, 0, 0]))
         state = changed.equilibrium(
             q, v, v, fext, released=("ap", "ml", "adduction"), derivatives=derivatives
         )
@@ -81,7 +83,7 @@ def by_differences(slack, step=1e-6):
 def fit(values_and_slopes):
     """Return slack lengths (m) by Gauss-Newton, the number of equilibria, and seconds."""
     global calls
-    calls, began, slack = 0, time.perf_counter(), np.array([0.0855, 0.0905])
+    calls, began, slack = 0, time.perf_counter(), np.array([0.0855, 0.0900])
     for _ in range(12):
         values, slopes = values_and_slopes(slack)
         step = np.linalg.lstsq(slopes, measured - values, rcond=None)[0]
@@ -99,7 +101,7 @@ fits = {
 }
 figure, axes = plt.subplots(figsize=(5, 3.4), layout="constrained")
 axes.plot(np.degrees(measured), moments, "o", color="#0072B2", label="curve to be fitted")
-first, last = np.array([0.0855, 0.0905]), fits["gradient"][0]
+first, last = np.array([0.0855, 0.0900]), fits["gradient"][0]
 for slack, label, style in ((first, "first guess", ":"), (last, "fitted", "-")):
     axes.plot(np.degrees(adductions(slack)[0]), moments, style, color="#D55E00", label=label)
 for name, (slack, count, seconds) in fits.items():

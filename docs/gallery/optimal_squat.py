@@ -2,8 +2,8 @@
 
 A planar leg stands on its fixed foot and carries half of the trunk. Crocoddyl finds the torques at
 ankle and hip and the tension of the quadriceps that bend the knee to 80 degrees and stretch it
-again. The second motion also pays for the peak pressure on the polyethylene. Both solutions begin
-at a squat with an upright trunk, whose forces come from inverse dynamics.
+again. The second motion also pays for the peak pressure on the polyethylene. The first guess stands
+still; the weight of the wanted flexion grows in steps, and each solution is the next first guess.
 """
 
 import time
@@ -19,6 +19,7 @@ import tkamb
 from tkamb.crocoddyl import CondylePressures, KneeDynamics, KneeStep
 
 FILES = Path(tkamb.__file__).parent / "io" / "starter" / "files"
+FLEXION_WEIGHT = 1000
 NODES, STEP, DEEPEST = 24, 0.05, np.radians(80.0)  # steps of 50 ms; deepest knee flexion
 femoral, insert = (
     trimesh.load(FILES / f"{name}.stl").apply_scale(1e-3)
@@ -54,7 +55,7 @@ knee = tkamb.Knee(
             ("femur", (-0.004, 0.0, z)),
             ("tibia", (0.0, 0.34, z)),
             tkamb.QuadraticToe(stiffness=4000.0),
-            slack_length=0.058,
+            slack_length=0.088,
         )
         for name, z in (("MCL", -0.04), ("LCL", 0.04))
     ],
@@ -81,51 +82,32 @@ class Torques(crocoddyl.ActuationModelAbstract):
         return data
 
 
-def held(q, u, last=None):
-    """Return q and controls u with the wanted flexion, by Newton's method.
-
-    The translations of the knee and u make the accelerations those of an implicit Euler step from
-    the state `last`; without it, zero.
-    """
-    for _ in range(60):
-        v = np.zeros(5) if last is None else (q - last[:5]) / STEP
-        wanted = np.zeros(5) if last is None else (v - last[5:]) / STEP
+def standing(q, u):
+    """Return the translations of the knee and controls without acceleration, by Newton's method."""
+    v = np.zeros(5)
+    for n in range(300):
         tensions, more = {"quadriceps": u[2]}, {"quadriceps": u[2] + 1.0}
         args = q, v, DRIVEN @ u[:2]
         a = knee.forward_dynamics(*args, tensions=tensions, data=data)
-        if np.abs(a - wanted).max() < 1e-6:
-            return q, v, u
-        by_q, by_v, by_tau = knee.forward_dynamics_derivatives(*args, tensions=tensions, data=data)
+        if np.abs(a).max() < 1e-6:
+            return q, u
+        by_q, _, by_tau = knee.forward_dynamics_derivatives(*args, tensions=tensions, data=data)
         by_pull = knee.forward_dynamics(*args, tensions=more, data=data) - a
-        if last is not None:
-            by_q = by_q + by_v / STEP - np.eye(5) / STEP**2
-        step = np.linalg.solve(
-            np.column_stack([by_q[:, 1:3], by_tau @ DRIVEN, by_pull]), wanted - a
-        )
-        step *= min(1.0, 2e-4 / np.abs(step[:2]).max())
+        step = np.linalg.solve(np.column_stack([by_q[:, 1:3], by_tau @ DRIVEN, by_pull]), -a)
+        step *= min(1.0, (2e-4 if n < 100 else 1e-5) / np.abs(step[:2]).max())
         q, u = q + np.array([0.0, *step[:2], 0.0, 0.0]), u + step[2:]
         u[2] = max(u[2], 0.0)
     raise RuntimeError("no equilibrium")
 
 
-def upright(flexion, q):
-    """Return q with a flexion, the hip above the ankle and the trunk upright."""
-    return np.array([-flexion / 2, q[1], q[2], flexion, -flexion / 2])
-
-
-q = upright(np.radians(15.0), np.zeros(5))
+bend = np.radians(15.0)  # the hip is above the ankle, and the trunk is upright
+q = np.array([-bend / 2, 0.0, 0.0, bend, -bend / 2])
 q[2] = knee.press(q, 400.0).pose.translation[1]
-q, v, rest = held(q, np.array([0.0, 0.0, 300.0]))
-start = np.concatenate([q, v])
-xs, us = [start], []
-for k in range(1, NODES + 1):
-    bend = q[3] + (DEEPEST - q[3]) * 0.5 * (1.0 - np.cos(2.0 * np.pi * k / NODES))
-    place, rate, control = held(upright(bend, xs[-1]), us[-1] if us else rest, xs[-1])
-    xs.append(np.concatenate([place, rate]))
-    us.append(control)
+q, rest = standing(q, np.array([0.0, 0.0, 300.0]))
+start = np.concatenate([q, np.zeros(5)])
 
 
-def squat(pressure_weight, xs, us):
+def squat(flexion_weight, pressure_weight, xs, us):
     """Return the solver after it has found a squat, from a first guess of states and controls."""
 
     def node(step, bend_weight=0.0, end_weight=0.0):
@@ -148,19 +130,25 @@ def squat(pressure_weight, xs, us):
         dynamics = KneeDynamics(state, Torques(state, 2), knee, costs, muscles=["quadriceps"])
         return KneeStep(dynamics, step)
 
-    running = [node(STEP, 1e3 if k == NODES // 2 else 0.0) for k in range(NODES)]
+    running = [node(STEP, flexion_weight if k == NODES // 2 else 0.0) for k in range(NODES)]
     problem = crocoddyl.ShootingProblem(start, running, node(0.0, end_weight=1e2))
     problem.nthreads = 1  # models in Python
     solver = crocoddyl.SolverFDDP(problem)
     solver.th_stop = 1e-6
-    solver.setCallbacks([crocoddyl.CallbackVerbose()])
-    solver.solve(xs, us, 60, True)
+    last = flexion_weight == FLEXION_WEIGHT
+    converged = solver.solve(xs, us, 100 if last else 8, True)
+    weights = f"weights {flexion_weight:g} and {pressure_weight:g}"
+    print(f"{weights}: {solver.iter} iterations, stop {solver.stop:.1e}")
+    assert converged or not last
     return solver
 
 
-began, solvers = time.perf_counter(), {}
-for name, weight in (("without pressure", 0.0), ("with pressure", 1.0)):
-    solvers[name] = squat(weight, xs, us)
+began, solvers, xs, us = time.perf_counter(), {}, [start] * (NODES + 1), [rest] * NODES
+for name, flexion_weight, pressure_weight in (
+    *(("without pressure", weight, 0.0) for weight in (3, 8, 20, 50, 150, 400, FLEXION_WEIGHT)),
+    ("with pressure", FLEXION_WEIGHT, 1.0),
+):
+    solvers[name] = squat(flexion_weight, pressure_weight, xs, us)
     xs, us = list(solvers[name].xs), list(solvers[name].us)
 seconds = time.perf_counter() - began
 
@@ -187,8 +175,6 @@ axes[3].set(xlabel="forward (m)", title="at the deepest point", aspect="equal")
 axes[0].legend(fontsize=7)
 figure.savefig("optimal_squat.png", dpi=100)
 
-for name, solver in solvers.items():
-    print(f"{name}: {solver.iter} iterations, stop {solver.stop:.1e}")
 print(f"{seconds:.0f} s; peak pressure {peaks[0]:.1f} and {peaks[1]:.1f} MPa")
 assert all(solver.stop <= 1e-6 for solver in solvers.values())
 assert peaks[1] < 0.95 * peaks[0], peaks

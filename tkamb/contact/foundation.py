@@ -86,10 +86,14 @@ class ElasticFoundation(ContactModel):
     p = -M ln(1 - d/h).
 
     Limits: neighbouring columns do not share load. The pressure therefore ends at the edge of the
-    overlap, and peaks at rims are too high. The energy depends slightly on how the map points lie:
-    the map holds a ball on a plate, which nothing else holds, with up to 0.1 % of the load at 1 mm
-    and 0.3 % at 2 mm. A column that meets the femur at less than 6 deg is unloaded. There, and
-    where an outline of the femoral component passes a column of the rim, the energy jumps
+    overlap, and peaks at rims are too high. The energy depends slightly on how the map points lie,
+    whatever the facets: the map holds a ball on a plate, which nothing else holds, under the linear
+    law with 32 k d J3(k a)/(k a)³ of the load, with the penetration d, the radius a of the contact
+    and k = 2 pi/resolution. For a ball of 25 mm under 500 N this is up to 0.1 % at 1 mm and 0.4 %
+    at 2 mm. Where a column crosses an edge of two femoral triangles, its force turns: at 2 mm the
+    force of the shipped knee jumps by 0.004 N (median of 57 crossings; the largest 0.3 N), every 11
+    µm along AP. A column that meets the femur at less than 6 deg is unloaded. There, and where an
+    outline of the femoral component passes a column of the rim, the energy jumps
     (`scripts/measure/energy`). If the penetration is at least half of the thickness, along y or
     along the normal, the result is OUT_OF_RANGE. Walls parallel to y carry no load. A mobile
     bearing is pressed like a fixed one. The approach counts from the first touch of the triangles;
@@ -355,7 +359,8 @@ class FoundationProbe:
 
         The stiffness of a column jumps when the column comes into contact. The transverse stiffness
         of the contact may then jump by half of its value. Here each column is weighted with the
-        share of its cell inside the edge of contact; the gap is linear across the cell.
+        share of its cell inside the edge of contact; the gap is linear across the cell. This adds
+        resolution²/6 to the square of a circular contact's radius.
         """
         samples, meeting = self._columns(pose)
         near = (meeting.gap < WIDEST_EDGE) & ~grazing(samples, meeting)

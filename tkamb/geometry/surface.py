@@ -172,7 +172,7 @@ class Surface:
     @cached_property
     def curved(self) -> "CurvedSurface":
         """The smooth surface that the triangles approximate."""
-        from tkamb.geometry.curved import CurvedSurface
+        from tkamb.geometry.curved import CurvedSurface  # imports numba, which is slow
 
         return CurvedSurface.of(self)
 

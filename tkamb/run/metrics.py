@@ -114,12 +114,12 @@ def split_undetermined(results: "Results") -> NDArray[np.bool_]:
 def moved_per_half_degree(results: "Results") -> Array:
     """Return the force (f,), N, that 0.5 deg of adduction shifts between the condyles.
 
-    The force is linear in the angle and at most the whole load. It is NaN if only one condyle is
-    loaded, since the slope changes when the other condyle touches.
+    The force is linear in the angle and at most the force of the more loaded condyle. It is NaN if
+    only one condyle is loaded, since the slope changes when the other condyle touches.
     """
     share = medial_share(results, "deformation")
     shift = 0.5 * np.abs(results["medial_force_per_adduction_N_per_deg"])
-    shift = np.minimum(shift, np.abs(results["force_si_N"]))
+    shift = np.minimum(shift, np.fmax(results["medial_force_N"], results["lateral_force_N"]))
     return np.where(np.abs(share - 0.5) < 0.5 - AGREEMENT.unloaded_share, shift, np.nan)
 
 

@@ -55,7 +55,7 @@ THIRD = 2 / 3 * WIDTH
 SCRIPTS = ("cursor.js", "units.js", "insert.js", "downloads.js", "start.js")
 """Scripts of the page, in their order."""
 COLOURS = (
-    "Lines run in time order. In every plot blue is medial, red is lateral and black is the total. "
+    "Lines run in time order. In every plot blue is medial, orange lateral and black the total. "
     "Violet is superior–inferior, teal is anterior–posterior and olive is medial–lateral. A moment "
     "or rotation has the colour of its axis. The colour of a ligament or muscle applies within "
     "one plot only."
@@ -214,9 +214,9 @@ def _legend(results: "Results", axis: HorizontalAxis, computed: int) -> list[str
 
 
 def _sentences(summary: dict[str, Any]) -> list[str]:
-    """Return residuals, notes, assumptions and parts not modelled, each once."""
+    """Return residuals, assumptions and parts not modelled, each once."""
     result: list[str] = []
-    for key in ("residuals", "notes", "assumptions"):
+    for key in ("residuals", "assumptions"):
         value = summary.get(key) or []
         result.extend([value] if isinstance(value, str) else [str(item) for item in value])
     missing = summary.get("not_modelled")
@@ -279,6 +279,7 @@ def _cursor_lines(panel: Panel) -> list[dict[str, Any]]:
         {
             "label": line.label,
             "colour": line.colour,
+            "dashed": line.dashed,
             "digits": digits,
             "values": _round(line.values),
         }

@@ -57,7 +57,7 @@ def _known_error(error: Mapping[str, Any] | str) -> str:
 
 
 def lead(results: "Results", axis: HorizontalAxis) -> list[tuple[str, str]]:
-    """Return the three first lines of the report: peak forces, their error, limits of use."""
+    """Return the first lines of the report: peak forces, their error, limits of use, notes."""
     split = split_of(results.columns)
     unsupported = conclusions(results)[1]
     words = texts.lines(
@@ -70,6 +70,7 @@ def lead(results: "Results", axis: HorizontalAxis) -> list[tuple[str, str]]:
         compared=compared_forces(results.summary),
         at=axis.at,
         kind=axis.kind,
+        notes=results.summary.get("notes") or [],
         wrong=[one[:1].lower() + re.split(r"[:.]", one[1:])[0] for one in unsupported],
     )
     return [(head, text) for head, _, text in (line.partition(" | ") for line in words)]
@@ -190,8 +191,11 @@ def _entries(results: "Results", axis: HorizontalAxis) -> list[Entry]:
         digits = 0 if axis.kind == "cycle" else 2
         entries.insert(0, (axis.kind, unit, axis.values, digits))
     entries.append(("total force", "BW", results["force_total_BW"], 2))
+    split = split_of(results.columns)
+    short = {"deformation": "deform.", "equilibrium": "equil."}.get(split.estimate, "")
     for side in ("medial", "lateral"):
-        entries.append((side, "N", results[f"{side}_force_N"], 0))
+        unit = f"N, {short}" if short else "N"
+        entries.append((side, unit, results[split.column(side)], 0))
     entries.append(("medial share", "deform.", medial_share(results, "deformation"), 2))
     entries.append(("medial share", "equil.", medial_share(results, "equilibrium"), 2))
     for name, column, digits in (

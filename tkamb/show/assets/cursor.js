@@ -45,7 +45,7 @@ function written(value, digits) {
 function readoutSpan(plot, line, frame) {
   const span = document.createElement("span"), swatch = document.createElement("i");
   const value = line.values[frame], digits = plot.scale === 1 ? line.digits : 0;
-  swatch.style.background = line.colour;
+  swatch.style.borderTop = `3px ${line.dashed ? "dashed" : "solid"} ${line.colour}`;
   const number = value === null ? "–" : written(value * plot.scale, digits);
   span.append(swatch, `${line.label} ${number}`);
   return span;
