@@ -74,3 +74,4 @@ class ImportRequest:
     muscles: bool = False
     cycle: tuple[float, float] | Literal["plates"] | None = None
     units: GivenUnits = field(default_factory=GivenUnits)
+    straight_ligaments: bool = False
