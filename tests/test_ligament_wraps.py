@@ -116,7 +116,8 @@ def test_work_of_the_pull_is_the_change_of_energy_and_the_tangent_its_slope(wrap
 @pytest.mark.parametrize("wrap", [CYLINDER, ELLIPSOID, TUBE], ids=lambda wrap: wrap.shape)
 def test_tension_has_no_jump_where_the_string_meets_a_surface(wrap):
     """Steps of 0.1 deg of flexion through the first contact: no step exceeds its neighbours."""
-    one = bundle(wrap, start=(0.03, 0.06, 0.005), end=(0.025, -0.05, 0.0))
+    # Stretched beyond the toe of the law, at whose end the stiffness doubles.
+    one = bundle(wrap, start=(0.03, 0.06, 0.005), end=(0.025, -0.05, 0.0), slack_length=0.09)
     angle = np.deg2rad(np.arange(5.0, 25.0, 0.1))
     femur = knee_pose(np.column_stack([np.zeros((len(angle), 5)), angle]))
     poses = {"femur": femur, "tibia": np.eye(4)}
