@@ -9,10 +9,10 @@ from scipy.integrate import quad
 from opensim_models import OWN, PUBLISHED, kinematics
 from opensim_references import references
 from tkamb.errors import InputError
-from tkamb.io.opensim.geodesic import shortest_strings
-from tkamb.io.opensim.model import WrapObject
 from tkamb.io.opensim.paths import LineSet
-from tkamb.io.opensim.wrapping import strings_over, touch
+from tkamb.knee.geodesic import shortest_strings
+from tkamb.knee.taut_strings import strings_over, touch
+from tkamb.knee.wrap_object import WrapObject
 
 RIGHT_LEG = ("hip", "knee", "ankle", "subtalar", "pf_", "patfem")
 

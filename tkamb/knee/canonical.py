@@ -17,7 +17,7 @@ give the rates qd and qdd of the knee coordinates, for any joints of the user's 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
@@ -34,6 +34,9 @@ from tkamb.geometry.frames import (
 from tkamb.knee.anatomy import Anatomy, FixedFrame, knee_size
 from tkamb.knee.chain import Chain, ChainMotion, ChainState
 from tkamb.knee.load import LinkPoint, PointForces, wrenches
+
+if TYPE_CHECKING:
+    from tkamb.knee.wrap_object import WrapObject
 
 # m and rad: pose error below which the iteration has converged. Chosen because it is near the
 # rounding error of double precision.
@@ -187,20 +190,34 @@ class Bridge:
         Raises:
             InputError: the frame is fixed to neither tibia, femur nor patella.
         """
+        link, in_link = self._on_link(point.link)
+        local = in_link.act(np.asarray(point.position, float))
+        return LinkPoint(link, MIRROR @ local if self.left else np.array(local))
+
+    def wrap_object(self, wrap: "WrapObject") -> "WrapObject":
+        """Return a wrap object on a frame of the user's model as one on a link of the chain.
+
+        Raises:
+            InputError: the frame is fixed to neither tibia, femur nor patella.
+        """
+        link, in_link = self._on_link(wrap.body)
+        moved = wrap.on(link, in_link.homogeneous)
+        return moved.mirrored() if self.left else moved
+
+    def _on_link(self, name: str) -> tuple[str, pin.SE3]:
+        """Return the link that a frame of the user's model is fixed to, and its pose in it."""
         anatomy = self.anatomy
         links = [("tibia", anatomy.tibia), ("femur", self.component)]
         if anatomy.patella is not None:
             links.append(("patella", anatomy.patella))
-        elif point.link == "patella" and "patella_ap" in self.chain.joints:
-            position = np.array(point.position)
-            return LinkPoint("patella", MIRROR @ position if self.left else position)
-        frame = anatomy.frame(point.link)
+        elif name == "patella" and "patella_ap" in self.chain.joints:
+            return "patella", pin.SE3.Identity()
+        frame = anatomy.frame(name)
         for link, base in links:
             if frame.joint == base.joint:
-                local = (base.placement.inverse() * frame.placement).act(point.position)
-                return LinkPoint(link, MIRROR @ local if self.left else np.array(local))
+                return link, base.placement.inverse() * frame.placement
         raise InputError(
-            f"frame '{point.link}' is fixed to neither tibia, femur nor patella",
+            f"frame '{name}' is fixed to neither tibia, femur nor patella",
             "Knee",
             "a line that leaves the knee is a muscle: Knee(..., muscles=[...])",
         )

@@ -162,7 +162,12 @@ class Instant:
         state = canonical_state(
             self.chain, replace(motion, joints=joints), self.shank, self.thigh, self.on_patella
         )
-        tensions, pulls = self._pulls(state)
+        tensions: dict[str, float] = {}
+        pulls: tuple[PointForces, ...] = ()
+        try:
+            tensions, pulls = self._pulls(state)
+        except ComputationError as error:
+            problems += (str(error),)
         geometry = KneeGeometry(
             state,
             self.ground,
@@ -185,7 +190,7 @@ class Instant:
             return {}, ()
         from tkamb.knee.ligaments import ligament_loads
 
-        links = {end.link for bundle in self.ligaments for end in (bundle.proximal, bundle.distal)}
+        links = {link for bundle in self.ligaments for link in bundle.links}
         tensions, loads = ligament_loads(self.ligaments, {link: state.pose(link) for link in links})
         names = [bundle.name for bundle in self.ligaments]
         return dict(zip(names, tensions.tolist(), strict=True)), loads

@@ -1,4 +1,4 @@
-"""Ligament bundles: straight lines between two links that pull and never push.
+"""Ligament bundles: straight or wrapping lines between two links that pull and never push.
 
 `tkamb.knee.ligament_laws` has the laws: tension by length.
 
@@ -24,6 +24,7 @@ from tkamb.geometry.surface import Surface
 from tkamb.knee.chain import Chain
 from tkamb.knee.ligament_laws import LIGAMENT_LAWS, LigamentLaw, StackedLaws, TwoLine
 from tkamb.knee.load import LinkPoint, PointForces, wrench_of
+from tkamb.knee.wrap_object import WrapObject
 from tkamb.units import DEGREE, MILLIMETRE
 
 # rad: largest difference between the reference flexion and the flexion of the nearest frame.
@@ -33,7 +34,10 @@ MAX_REFERENCE_DISTANCE = 15.0 * DEGREE
 
 @dataclass(frozen=True, eq=False)
 class Ligament:
-    """One bundle on a straight line between a point of one link and a point of another.
+    """One bundle between a point of one link and a point of another, straight or over surfaces.
+
+    Tension acts along the taut path (`tkamb.knee.ligament_paths`). It pulls both ends, and presses
+    on the links of the surfaces that the path touches, so that all forces balance.
 
     Args:
         name: name of the bundle.
@@ -44,6 +48,8 @@ class Ligament:
         slack_length: slack length, m; NaN: it is computed from the reference strain.
         reference_strain: strain at the reference pose, 1.
         reference_flexion: flexion of the reference pose, rad.
+        wraps: surfaces that the bundle wraps; the body of each is a link. A section is wrapped from
+            the proximal to the distal end. Empty: the bundle is straight.
 
     Raises:
         InputError: the law is no `LigamentLaw`.
@@ -56,6 +62,7 @@ class Ligament:
     slack_length: float = float("nan")
     reference_strain: float = float("nan")
     reference_flexion: float = 0.0
+    wraps: tuple[WrapObject, ...] = ()
 
     def __post_init__(self) -> None:
         if not isinstance(self.law, LigamentLaw):
@@ -74,8 +81,44 @@ class Ligament:
         proximal = transform(poses[self.proximal.link], self.proximal.position)
         return proximal, transform(poses[self.distal.link], self.distal.position)
 
+    @property
+    def links(self) -> tuple[str, ...]:
+        """Names of the links of both ends and of the surfaces, each once."""
+        bodies = (wrap.body for wrap in self.wraps)
+        return tuple(dict.fromkeys((self.proximal.link, self.distal.link, *bodies)))
+
+    def on_links(self, placed: Mapping[str, tuple[str, Array]]) -> "Ligament":
+        """Return the same bundle with ends and surfaces given on other links.
+
+        Args:
+            placed: link -> another link that moves with it, and pose_link_in_other (4, 4).
+        """
+
+        def point(end: LinkPoint) -> LinkPoint:
+            link, pose = placed[end.link]
+            return LinkPoint(link, transform(pose, end.position))
+
+        wraps = tuple(wrap.on(*placed[wrap.body]) for wrap in self.wraps)
+        return replace(self, proximal=point(self.proximal), distal=point(self.distal), wraps=wraps)
+
+    def points(self, poses: Mapping[str, Array]) -> Array:
+        """Return points (..., n, 3), m, along the path in the insert frame, ends included.
+
+        Args:
+            poses: link -> pose_link_in_insert, shape (4, 4) or (f, 4, 4).
+        """
+        if self.wraps:
+            from tkamb.knee.ligament_paths import bundle_paths  # imports numba
+
+            return bundle_paths(self, poses).points
+        return np.stack(self.ends(poses), axis=-2)
+
     def length(self, poses: Mapping[str, Array]) -> Array:
-        """Return the distance (...,) between the ends, m."""
+        """Return the length (...,) of the path, m; NaN if there is no taut path."""
+        if self.wraps:
+            from tkamb.knee.ligament_paths import bundle_paths  # imports numba
+
+            return bundle_paths(self, poses).length
         proximal, distal = self.ends(poses)
         return np.asarray(np.linalg.norm(distal - proximal, axis=-1))
 
@@ -88,25 +131,47 @@ class Ligament:
         return self.law.tension(length, self.slack_length)
 
 
+PROXIMAL, DISTAL = "proximal", "distal"
+"""Names of the two bodies of `BundleArrays`."""
+# m: step of the finite differences of bundles that wrap. Chosen because a path is exact to 1e-11,
+# and its curvature changes over millimetres.
+DIFFERENCE_STEP = 1e-6
+# m: arm that turns the step into a rotation. Chosen as the order of the knee's radius.
+DIFFERENCE_ARM = 0.03
+
+
 @dataclass(frozen=True, eq=False)
 class BundleArrays:
-    """Arrays of m bundles. All proximal ends share one frame, and all distal ends share one frame.
+    """Bundles between two bodies: arrays of m straight bundles, and the bundles that wrap.
+
+    All proximal ends share one frame, and all distal ends share one frame.
 
     Args:
         proximal: proximal ends, shape (m, 3), m.
         distal: distal ends, shape (m, 3), m.
         laws: their laws.
         slack_length: slack lengths, shape (m,), m.
+        wrapping: bundles that wrap, with the links `PROXIMAL` and `DISTAL`.
     """
 
     proximal: Array
     distal: Array
     laws: StackedLaws
     slack_length: Array
+    wrapping: tuple[Ligament, ...] = ()
+
+    @classmethod
+    def between(cls, bundles: Sequence[Ligament]) -> "BundleArrays":
+        """Return bundles with ends and surfaces on the links `PROXIMAL` and `DISTAL`."""
+        straight = [bundle for bundle in bundles if not bundle.wraps]
+        ends = [{e.link: e.position for e in (b.proximal, b.distal)} for b in straight]
+        first, last = (np.array([end[link] for end in ends]) for link in (PROXIMAL, DISTAL))
+        wrapping = tuple(bundle for bundle in bundles if bundle.wraps)
+        return replace(cls.of(straight, first, last), wrapping=wrapping)
 
     @classmethod
     def of(cls, bundles: Sequence[Ligament], proximal: Array, distal: Array) -> "BundleArrays":
-        """Return the arrays of bundles with the given ends (m, 3), m."""
+        """Return the arrays of straight bundles with the given ends (m, 3), m."""
         return cls(
             proximal.reshape(-1, 3),
             distal.reshape(-1, 3),
@@ -115,7 +180,7 @@ class BundleArrays:
         )
 
     def pulls(self, proximal: Array, distal: Array) -> tuple[Array, Array]:
-        """Return the tensions (..., m), N, and the forces (..., m, 3), N, on the distal ends.
+        """Return tensions (..., m), N, and forces (..., m, 3), N, on distal ends.
 
         Args:
             proximal: proximal ends, shape (..., m, 3), m.
@@ -130,7 +195,8 @@ class BundleArrays:
         """Return the derivative (6, 6) of `wrench` by a small displacement of the proximal body.
 
         The pull T u on a distal end changes by (T/L (I - u u^T) + T' u u^T) dx, where dx is the
-        displacement of the proximal end, L the length and T' the slope of the law.
+        displacement of the proximal end, L the length and T' the slope of the law. Bundles that
+        wrap have central differences.
 
         Args:
             pose: pose of the proximal frame in the distal frame, shape (4, 4).
@@ -149,6 +215,11 @@ class BundleArrays:
                 move = np.hstack([eye, np.cross(p, eye)])
                 by_displacement = change @ move
                 total += np.vstack([by_displacement, np.cross(d, by_displacement.T).T])
+        if self.wrapping:
+            from tkamb.knee.contact import DifferenceSettings, differences
+
+            settings = DifferenceSettings(step=DIFFERENCE_STEP, arm=DIFFERENCE_ARM)
+            total += differences(self._wrapping_wrench, pose, settings)
         return total
 
     def wrench(self, poses: Array) -> Array:
@@ -160,20 +231,55 @@ class BundleArrays:
         proximal = np.einsum("...ij,mj->...mi", poses[..., :3, :3], self.proximal)
         proximal = proximal + poses[..., None, :3, 3]
         _, pull = self.pulls(proximal, self.distal)
-        return wrench_of(self.distal, pull).sum(axis=-2)
+        total = wrench_of(self.distal, pull).sum(axis=-2)
+        return total + self._wrapping_wrench(poses) if self.wrapping else total
+
+    def _wrapping_wrench(self, poses: Array) -> Array:
+        from tkamb.knee.ligament_paths import taut_wrenches  # imports numba
+
+        placed = {PROXIMAL: poses, DISTAL: np.eye(4)}
+        pulled = [taut_wrenches(bundle, placed)[1][DISTAL] for bundle in self.wrapping]
+        return np.asarray(np.sum(pulled, axis=0))
 
 
 def ligament_loads(
     ligaments: Sequence[Ligament], poses: Mapping[str, Array]
 ) -> tuple[Array, tuple[PointForces, ...]]:
-    """Return the tensions (n,), N, and one load per link.
+    """Return the tensions (n,), N, and the loads on the links; their sum is zero.
 
-    The forces on the two ends of a bundle are equal and opposite, along the line through both ends.
+    The forces on the two ends of a straight bundle are equal and opposite, along the line through
+    both ends. There is one load per link for all straight bundles, and one for each bundle that
+    wraps.
 
     Args:
         ligaments: the bundles.
         poses: link -> pose_link_in_insert (4, 4).
+
+    Raises:
+        ComputationError: a bundle has no taut path over its surfaces.
     """
+    wraps = np.array([bool(bundle.wraps) for bundle in ligaments])
+    if not wraps.any():
+        return _straight_loads(ligaments, poses)
+    from tkamb.knee.ligament_paths import taut_wrenches  # imports numba
+
+    loads: list[PointForces] = []
+    tension = np.zeros(len(ligaments))
+    straight = [bundle for bundle in ligaments if not bundle.wraps]
+    if straight:
+        tension[~wraps], straight_loads = _straight_loads(straight, poses)
+        loads += straight_loads
+    for k in np.flatnonzero(wraps).tolist():
+        pull, on_links = taut_wrenches(ligaments[k], poses)
+        tension[k] = float(pull)
+        for link, wrench in on_links.items():
+            loads.append(PointForces(link, np.zeros((1, 3)), wrench[None, :3], wrench[3:]))
+    return tension, tuple(loads)
+
+
+def _straight_loads(
+    ligaments: Sequence[Ligament], poses: Mapping[str, Array]
+) -> tuple[Array, tuple[PointForces, ...]]:
     points = [*(bundle.proximal for bundle in ligaments), *(bundle.distal for bundle in ligaments)]
     links = np.array([point.link for point in points]).reshape(2, -1)
     link_poses = np.array([poses[point.link] for point in points], float)
@@ -212,11 +318,18 @@ def build_ligaments(
 
 def _with_slack_length(bundle: Ligament, poses: Mapping[str, Array], flexion: Array) -> Ligament:
     where = f"ligament {bundle.name}"
-    for end in (bundle.proximal, bundle.distal):
-        if end.link not in poses:
-            raise InputError(f"no link '{end.link}'", where, names_near(end.link, poses))
+    for link in bundle.links:
+        if link not in poses:
+            raise InputError(f"no link '{link}'", where, names_near(link, poses))
     reference = nearest_frame(flexion, bundle.reference_flexion)
     length = float(bundle.length(_frame(poses, reference)))
+    if np.isnan(length):
+        raise InputError(
+            f"has no taut path over {', '.join(wrap.name for wrap in bundle.wraps)} at "
+            f"{flexion[reference] / DEGREE:.0f} deg of flexion",
+            where,
+            "no end may lie inside a cylinder, a sphere or a section: check the surface's place",
+        )
     if length == 0.0:
         raise InputError("both ends are the same point", where)
     # A slack length that is given needs no reference pose.

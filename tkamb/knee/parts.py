@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from tkamb.errors import InputError
-from tkamb.geometry.frames import Array, inverse, mirrored_pose, transform
+from tkamb.geometry.frames import Array, inverse, mirrored_pose
 from tkamb.geometry.surface import Surface
 from tkamb.knee.anatomy import Anatomy, FixedFrame
 from tkamb.knee.canonical import Bridge, se3
@@ -243,14 +243,15 @@ def placed_insert(
 
 
 def bundle_on_chain(bridge: Bridge, bundle: "Ligament") -> "Ligament":
-    """Return a bundle with its ends on links of the chain.
+    """Return a bundle with its ends and surfaces on links of the chain.
 
     Raises:
         InputError: the slack length is missing, or an end is on a frame outside the knee.
     """
     ends = [bridge.link_point(link_point(end)) for end in (bundle.proximal, bundle.distal)]
     check_length(bundle.slack_length, "slack_length", f"ligament {bundle.name}")
-    return replace(bundle, proximal=ends[0], distal=ends[1])
+    wraps = tuple(bridge.wrap_object(wrap) for wrap in bundle.wraps)
+    return replace(bundle, proximal=ends[0], distal=ends[1], wraps=wraps)
 
 
 def crossing_and_others(
@@ -260,25 +261,15 @@ def crossing_and_others(
 
     The ends of the arrays are in the femoral frame and the insert frame.
     """
-    crossing = [
-        bundle
-        for bundle in bundles
-        if {bundle.proximal.link, bundle.distal.link} == {"femur", "tibia"}
-    ]
+    crossing = [bundle for bundle in bundles if set(bundle.links) == {"femur", "tibia"}]
     others = tuple(bundle for bundle in bundles if bundle not in crossing)
     if not crossing:
         return None, others
-    from tkamb.knee.ligaments import BundleArrays
+    from tkamb.knee.ligaments import DISTAL, PROXIMAL, BundleArrays
 
     # The pose of the knee is that of the femoral frame in the insert frame.
-    shank = inverse(chain.insert_in_tibia)
-    ends: dict[str, list[Array]] = {"femur": [], "tibia": []}
-    for bundle in crossing:
-        for end in (bundle.proximal, bundle.distal):
-            position = transform(shank, end.position) if end.link == "tibia" else end.position
-            ends[end.link].append(position)
-    arrays = BundleArrays.of(crossing, np.array(ends["femur"]), np.array(ends["tibia"]))
-    return arrays, others
+    placed = {"femur": (PROXIMAL, np.eye(4)), "tibia": (DISTAL, inverse(chain.insert_in_tibia))}
+    return BundleArrays.between([bundle.on_links(placed) for bundle in crossing]), others
 
 
 def extensor_lines(bridge: Bridge, extensor: Extensor, surfaces: Surfaces) -> "ExtensorLines":

@@ -241,21 +241,24 @@ def crossing_bundles(
 
     An end on the patella is fixed to the femur here.
     """
-    from tkamb.knee.ligaments import BundleArrays
+    from tkamb.knee.ligaments import DISTAL, PROXIMAL, BundleArrays
 
     state, chain = geometry.state, geometry.state.chain
-    to_femur = inverse(knee_pose(coordinates))
-    crossing, femur, shank = [], [], []
+    bodies = {
+        PROXIMAL: (PROXIMAL, inverse(knee_pose(coordinates))),
+        DISTAL: (DISTAL, np.eye(4)),
+    }
+    crossing = []
     for bundle in ligaments:
-        ends = {
-            chain.on_shank(end.link): transform(state.pose(end.link), end.position)
-            for end in (bundle.proximal, bundle.distal)
-        }
-        if len(ends) == 2:
-            crossing.append(bundle)
-            femur.append(transform(to_femur, ends[False]))
-            shank.append(ends[True])
-    return BundleArrays.of(crossing, np.array(femur), np.array(shank))
+        placed = bundle.on_links(
+            {
+                link: (DISTAL if chain.on_shank(link) else PROXIMAL, state.pose(link))
+                for link in bundle.links
+            }
+        )
+        if len(placed.links) == 2:
+            crossing.append(placed.on_links(bodies))
+    return BundleArrays.between(crossing)
 
 
 # m: arm that makes rotations comparable to translations. Chosen as half the usual distance of the

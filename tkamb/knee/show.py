@@ -106,9 +106,9 @@ def show_knee(
             1.0,
         )
     for bundle in knee.ligaments:
-        if {bundle.proximal.link, bundle.distal.link} <= set(poses):
-            ends = np.array(bundle.ends(poses))
-            _strand(tree["ligaments"][bundle.name], in_world(ends), LIGAMENT)
+        if set(bundle.links) <= set(poses):
+            path = in_world(bundle.points(poses))
+            _strand(tree["ligaments"][bundle.name], path, LIGAMENT)
     for name, path in knee._extensor_paths(poses).items():
         _strand(tree["extensor"][name], in_world(path), MUSCLE)
     if contact is not None and np.isfinite(contact.pressure).all():

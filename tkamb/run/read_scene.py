@@ -149,10 +149,10 @@ def link_poses(case: Case, poses: Array, extensor: "ExtensorFrames | None") -> d
     if extensor is not None:
         places = [sagittal_pose(extensor.joints(k)[0]) for k in range(len(poses))]
         result["patella"] = poses @ chain.patella_joint_in_femur @ np.array(places)
-    ends = [end for line in case.ligaments for end in (line.proximal, line.distal)]
+    links = {link for bundle in case.ligaments for link in bundle.links}
     if ligament is not None:
-        ends += [ligament.proximal, ligament.distal]
-    for link in {end.link for end in ends} - set(result):
+        links |= {ligament.proximal.link, ligament.distal.link}
+    for link in links - set(result):
         carrier = chain.carrier(link)
         result[link] = result[carrier] @ chain.link_in(link, carrier)
     return result

@@ -129,9 +129,9 @@ def _lines(recording: Recording, state: ChainState) -> list[tuple[Array, str, st
     segments: list[tuple[Array, str, str]] = []
     named: set[str] = set()
     for bundle in recording.ligaments:
-        poses = {link: state.pose(link) for link in (bundle.proximal.link, bundle.distal.link)}
+        poses = {link: state.pose(link) for link in bundle.links}
         name = bundle.name.removeprefix("generic_").split("_")[0].rstrip("0123456789")
-        segments.append((np.stack(bundle.ends(poses)), LIGAMENT, "" if name in named else name))
+        segments.append((bundle.points(poses), LIGAMENT, "" if name in named else name))
         named.add(name)
     if recording.extensor is not None:
         with suppress(ComputationError):  # the pose of the patella has no solution in this frame

@@ -12,6 +12,7 @@ from tkamb.io.importing.model_motion import MOTION_FILE, motion_tables
 from tkamb.io.importing.recorded_poses import RecordedPoses, ShankMarkers
 from tkamb.io.importing.soft_tissue import End, SoftTissue
 from tkamb.io.recordings.unit_words import GivenUnits
+from tkamb.io.scene.parts import wrap_table
 from tkamb.io.toml_text import toml_markers, toml_mm, toml_value
 from tkamb.units import DEGREE
 
@@ -314,6 +315,9 @@ class SceneText:
                 lines += [_end("proximal", b.proximal), _end("distal", b.distal)]
                 lines.append(f"stiffness_N_per_strain = {b.stiffness_N:g}")
                 lines.append(f"slack_length_mm = {b.slack_length_m * 1e3:.4f}")
+                if b.wraps:
+                    tables = ", ".join(toml_value(wrap_table(wrap), 6) for wrap in b.wraps)
+                    lines.append(f"wrap = [{tables}]")
             return lines[1:]
         if self.meshes is None:
             return []

@@ -4,9 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, inverse, transform
 from tkamb.io.importing.links import Links, body_link
 from tkamb.io.opensim.model import OpenSimLigament, Path, PathPoint
+from tkamb.knee.wrap_object import WrapObject
 
 # Strain at the end of the toe region of the law "quadratic-toe": twice the 0.03 of Blankevoort
 # (1991).
@@ -23,13 +24,14 @@ class End:
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """A ligament strand with the law "quadratic-toe"."""
+    """A ligament strand with the law "quadratic-toe", and the surfaces on links that it wraps."""
 
     name: str
     proximal: End
     distal: End
     stiffness_N: float
     slack_length_m: float
+    wraps: tuple[WrapObject, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,12 +53,17 @@ class SoftTissue:
     remarks: tuple[str, ...]
 
 
-def soft_tissue(links: Links) -> SoftTissue:
-    """Return the muscles and ligaments of a leg that the scene can describe."""
+def soft_tissue(links: Links, straight_ligaments: bool = False) -> SoftTissue:
+    """Return the muscles and ligaments of a leg that the scene can describe.
+
+    Args:
+        links: links of the leg.
+        straight_ligaments: whether the surfaces that ligaments wrap are left out.
+    """
     text: list[str] = []
     quadriceps = _quadriceps(links, text)
     ligament, length = _patellar_ligament(links, text)
-    bundles = _bundles(links, text)
+    bundles = _bundles(links, text, straight_ligaments)
     _name_muscles(links, text)
     return SoftTissue(quadriceps, ligament, length, bundles, tuple(text))
 
@@ -126,10 +133,11 @@ def _patellar_ligament(links: Links, remarks: list[str]) -> tuple[tuple[End, End
     return (ends[0], ends[1]), length
 
 
-def _bundles(links: Links, remarks: list[str]) -> tuple[Bundle, ...]:
+def _bundles(links: Links, remarks: list[str], straight: bool) -> tuple[Bundle, ...]:
     leg = links.leg
     bundles: list[Bundle] = []
     omitted: dict[str, list[str]] = {}
+    ignored: dict[str, list[str]] = {}
     for ligament in leg.model.ligaments.values():
         femur, tibia = _fixed(ligament.path, leg.femur), _fixed(ligament.path, leg.tibia)
         if not (femur and tibia):
@@ -145,16 +153,50 @@ def _bundles(links: Links, remarks: list[str]) -> tuple[Bundle, ...]:
                 _end(tibia[-1]),
                 ligament.stiffness_N,
                 ligament.slack_length_m,
+                () if straight else _wraps(links, ligament, ignored),
             )
         )
     if bundles:
+        wrapped = sum(bool(bundle.wraps) for bundle in bundles)
         remarks.append(
-            f"{len(bundles)} femorotibial ligament strands imported as straight lines "
-            "(wraps on bone are left out)"
+            f"{len(bundles)} femorotibial ligament strands imported, {wrapped} of them over "
+            "surfaces of the model, the others as straight lines"
+            + (" (wraps on bone are left out)" if straight else "")
         )
+    for reason, names in ignored.items():
+        remarks.append(f"surfaces left out, {reason}: {some_names(names)}")
     for reason, names in omitted.items():
         remarks.append(f"ligaments left out, {reason}: {some_names(names)}")
     return tuple(bundles)
+
+
+def _wraps(
+    links: Links, ligament: OpenSimLigament, ignored: dict[str, list[str]]
+) -> tuple[WrapObject, ...]:
+    """Return the surfaces of a strand, and add reason -> strand of those that are left out."""
+    from tkamb.knee.taut_strings import inside  # imports numba
+
+    result = []
+    for use in ligament.path.wraps:
+        wrap = links.leg.model.wrap_objects[use.wrap_object]
+        reason = "" if wrap.active else "switched off in the model"
+        if wrap.body not in (*links.leg.femur, *links.leg.tibia):
+            reason = "which belong neither to femur nor to tibia"
+        elif wrap.shape == "torus" or wrap.quadrant is not None:
+            reason = "a torus or half of a surface, which the scene does not have"
+        for point in ligament.path.points:
+            if isinstance(point, PathPoint) and point.body == wrap.body:
+                place = transform(inverse(wrap.pose), point.location)
+                within = inside(wrap, place[None])[0]
+                if wrap.shape == "ellipsoid":
+                    within = np.linalg.norm(place / np.array(wrap.dimensions)) < 1.0
+                if within:
+                    reason = "inside which an end is fixed, so that OpenSim ignores them, too"
+        if reason:
+            ignored.setdefault(reason, []).append(ligament.name)
+        else:
+            result.append(wrap.on(body_link(wrap.body), np.eye(4)))
+    return tuple(result)
 
 
 def _omission_reason(ligament: OpenSimLigament, fixed: int) -> str:

@@ -8,11 +8,11 @@ Seth et al., PLoS Comput Biol 14:e1006223 (2018), doi:10.1371/journal.pcbi.10062
 """
 
 from dataclasses import dataclass
-from typing import Literal
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.io.opensim.functions import Function
+from tkamb.knee.wrap_object import WrapObject
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,32 +51,6 @@ class MovingPathPoint:
 
 
 AnyPathPoint = PathPoint | ConditionalPathPoint | MovingPathPoint
-Shape = Literal["cylinder", "sphere", "ellipsoid", "torus"]
-
-
-@dataclass(frozen=True, eq=False)
-class WrapObject:
-    """A surface fixed to a body, around which paths wrap.
-
-    Args:
-        name: the object's name.
-        body: name of the body.
-        shape: "cylinder" (along its z), "sphere", "ellipsoid" or "torus" (about its z).
-        pose: (4, 4) pose_object_in_body.
-        dimensions: m. Cylinder: radius, length; sphere: radius; ellipsoid: semi-axes x, y, z;
-            torus: radius of the centre line, radius of the tube.
-        quadrant: axis (0, 1 or 2) and sign (±1) of the half on which paths must lie; None: either
-            half.
-        active: whether paths wrap around the object.
-    """
-
-    name: str
-    body: str
-    shape: Shape
-    pose: Array
-    dimensions: tuple[float, ...]
-    quadrant: tuple[int, int] | None
-    active: bool
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,9 @@ from tkamb.io.opensim.model import (
     Path,
     PathPoint,
     PathWrap,
-    Shape,
-    WrapObject,
 )
 from tkamb.io.opensim.read_joints import Frames, offset_pose
+from tkamb.knee.wrap_object import Shape, WrapObject
 
 MUSCLES = (
     "Thelen2003Muscle",

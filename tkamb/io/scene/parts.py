@@ -1,17 +1,20 @@
 """Implants, muscles and ligaments of a scene, in SI units. A left knee is mirrored."""
 
-from typing import TYPE_CHECKING
+import re
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tkamb.errors import InputError
-from tkamb.geometry.frames import MIRROR, Array, pose
+from tkamb.geometry.frames import MIRROR, Array, mirrored_pose, pose
 from tkamb.io.scene.scene import Scene
 from tkamb.io.scene.tables import (
     Attachment,
     BoneTable,
     FemoralImplantTable,
     LigamentTable,
+    LigamentWrapTable,
     MuscleTable,
     MuscleWrapTable,
     PatellarImplantTable,
@@ -24,6 +27,7 @@ if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
     from tkamb.knee.ligaments import Ligament
     from tkamb.knee.muscles import Muscle, PatellarLigament, SagittalWrap
+    from tkamb.knee.wrap_object import WrapObject
 
 NAN = float("nan")
 
@@ -196,7 +200,14 @@ def read_ligaments(scene: Scene, parts: ImplantParts, chain: Chain) -> "tuple[Li
     from tkamb.knee.ligaments import check_collateral_sides, generic_ligaments
 
     side = scene.patient.side
-    bundles = tuple(ligament(table, side == "left") for table in scene.ligament)
+    is_left = side == "left"
+    bundles = tuple(
+        replace(
+            ligament(table, is_left),
+            wraps=tuple(wrap_object(wrap, parts, chain, is_left) for wrap in table.wrap),
+        )
+        for table in scene.ligament
+    )
     check_collateral_sides(bundles, chain, side)
     if scene.generic_ligaments:
         assert parts.femoral is not None and parts.insert is not None
@@ -206,7 +217,7 @@ def read_ligaments(scene: Scene, parts: ImplantParts, chain: Chain) -> "tuple[Li
 
 
 def ligament(table: LigamentTable, left: bool = False) -> "Ligament":
-    """Return the bundle that a table describes, mirrored if `left`."""
+    """Return the bundle that a table describes, without its surfaces, mirrored if `left`."""
     from tkamb.knee.ligament_laws import ligament_law
     from tkamb.knee.ligaments import Ligament
 
@@ -223,6 +234,75 @@ def ligament(table: LigamentTable, left: bool = False) -> "Ligament":
         NAN if table.reference_strain is None else table.reference_strain,
         table.reference_flexion_deg * DEGREE,
     )
+
+
+def wrap_object(
+    table: LigamentWrapTable, parts: ImplantParts, chain: Chain, left: bool = False
+) -> "WrapObject":
+    """Return the surface that a table describes, mirrored if `left`.
+
+    Raises:
+        InputError: an outline is not convex, or a component is missing or not cut by the section.
+    """
+    from scipy.spatial.transform import Rotation
+
+    from tkamb.geometry.polygons import convex_outline
+    from tkamb.knee.wrap_object import WrapObject, mesh_section
+
+    turn = Rotation.from_euler("XYZ", table.rotation_deg, degrees=True).as_matrix()
+    placed = pose(turn, np.array(table.position_mm) * MILLIMETRE)
+    if table.part is not None:
+        surface = parts.insert if table.part == "insert" else parts.femoral
+        if surface is None:
+            raise InputError(
+                f"the scene does not read the {table.part}", f"wrap {table.name}", "give [contact]"
+            )
+        here = mirrored_pose(placed) if left else placed
+        band, offset = table.band_mm * MILLIMETRE, table.offset_mm * MILLIMETRE
+        found = mesh_section(table.name, "femur", surface, here, band, offset)
+        return found.on("tibia", chain.insert_in_tibia) if table.part == "insert" else found
+    assert table.link is not None
+    outline: Array | None = None
+    sizes = (table.radius_mm, table.length_mm, *(table.semi_axes_mm or ()))
+    if table.outline_mm is not None:
+        corners = np.array(table.outline_mm, float) * MILLIMETRE
+        outline = convex_outline(corners)
+        if len(outline) != len(corners):
+            raise InputError("outline_mm is not strictly convex", f"wrap {table.name}")
+    dimensions = tuple(float(size) * MILLIMETRE for size in sizes if size is not None)
+    found = WrapObject(table.name, table.link, table.shape, placed, dimensions, outline=outline)
+    return found.mirrored() if left else found
+
+
+def wrap_table(wrap: "WrapObject", left: bool = False) -> dict[str, Any]:
+    """Return the table that describes a surface, mirrored if `left`.
+
+    Raises:
+        InputError: a scene has no such shape.
+    """
+    from scipy.spatial.transform import Rotation
+
+    if wrap.shape == "torus" or wrap.quadrant is not None:
+        raise InputError(
+            "a scene has no torus and no half of a surface", f"wrap object {wrap.name}"
+        )
+    placed = (wrap.mirrored() if left else wrap).pose
+    sizes = [float(size) / MILLIMETRE for size in wrap.dimensions]
+    if wrap.shape == "ellipsoid":
+        keys: dict[str, Any] = {"semi_axes_mm": sizes}
+    elif wrap.outline is not None:
+        keys = {"outline_mm": (wrap.outline / MILLIMETRE).tolist()}
+    else:
+        keys = dict(zip(("radius_mm", "length_mm"), sizes, strict=False))
+    turn = Rotation.from_matrix(placed[:3, :3]).as_euler("XYZ", degrees=True)
+    return {
+        "name": re.sub(r"\W", "_", wrap.name, flags=re.ASCII),
+        "shape": wrap.shape,
+        "link": wrap.body,
+        "position_mm": (placed[:3, 3] / MILLIMETRE).tolist(),
+        "rotation_deg": turn.tolist(),
+        **keys,
+    }
 
 
 def _point(end: Attachment, left: bool) -> LinkPoint:

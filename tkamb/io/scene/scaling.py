@@ -109,6 +109,7 @@ def _ligament(bundle: "Ligament", s: float) -> "Ligament":
         distal=_point(bundle.distal, s),
         law=bundle.law.scaled(s),
         slack_length=bundle.slack_length * s,
+        wraps=tuple(wrap.scaled(s) for wrap in bundle.wraps),
     )
 
 

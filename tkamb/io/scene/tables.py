@@ -91,8 +91,69 @@ STIFFNESS_KEYS = {
 """Unit of a ligament law -> key of the scene, and its unit in SI."""
 
 
+class LigamentWrapTable(SceneTable):
+    """A surface that a bundle wraps, fixed to a link.
+
+    `cylinder` (along its z axis) takes `radius_mm` and `length_mm`, `sphere` takes `radius_mm`,
+    `ellipsoid` takes `semi_axes_mm`. `section` is the convex section of a mesh, extruded along the
+    z axis: of the scene's insert or femoral component (`part`), or a polygon (`outline_mm`). With x
+    to the right and y up, a bundle passes clockwise in front of a section (+x) from its proximal to
+    its distal end.
+    """
+
+    name: str = Field(pattern="^[A-Za-z0-9_]+$")
+    shape: Literal["cylinder", "sphere", "ellipsoid", "section"]
+    link: str | None = Field(
+        None, description="default with part: tibia (in the insert frame) or femur"
+    )
+    position_mm: Point = Field((0.0, 0.0, 0.0), description="centre, in the link's frame")
+    rotation_deg: Turn = Field(
+        (0.0, 0.0, 0.0), description="intrinsic x-y-z rotation of the surface in the link's frame"
+    )
+    # Upper limits: twice the length of a leg for a cylinder without end, and the width of a knee.
+    radius_mm: Annotated[Number | None, within(0.1, 100, "give it in millimetres")] = None
+    length_mm: Annotated[Number | None, within(0.1, 2000, "give it in millimetres")] = None
+    semi_axes_mm: (
+        tuple[
+            Annotated[Number, within(0.1, 100, "give it in millimetres")],
+            Annotated[Number, within(0.1, 100, "give it in millimetres")],
+            Annotated[Number, within(0.1, 100, "give it in millimetres")],
+        ]
+        | None
+    ) = None
+    part: Literal["insert", "femoral"] | None = Field(
+        None, description="component whose section is wrapped"
+    )
+    band_mm: Band = Field(0.0, description="the outline encloses sections up to this distance")
+    offset_mm: HalfThickness = Field(0.0, description="distance of the bundle from the section")
+    outline_mm: tuple[tuple[Number, Number], ...] | None = Field(
+        None, description="convex polygon (x, y), counter-clockwise, instead of part"
+    )
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        wanted = {
+            "cylinder": {"radius_mm", "length_mm"},
+            "sphere": {"radius_mm"},
+            "ellipsoid": {"semi_axes_mm"},
+            "section": {"part"} if self.part else {"outline_mm"},
+        }[self.shape]
+        sizes = ("radius_mm", "length_mm", "semi_axes_mm", "part", "outline_mm")
+        given = {key for key in sizes if getattr(self, key) is not None}
+        if given != wanted:
+            names = (
+                "part or outline_mm" if self.shape == "section" else " and ".join(sorted(wanted))
+            )
+            raise ValueError(f"shape '{self.shape}' takes {names}, and no other size")
+        if self.part is None and (self.band_mm or self.offset_mm):
+            raise ValueError("band_mm and offset_mm need part")
+        if (self.link is None) == (self.part is None):
+            raise ValueError("give link, or part without link")
+        return self
+
+
 class LigamentTable(SceneTable):
-    """One bundle: tension only, on a straight line.
+    """One bundle: tension only, on a straight line or over surfaces.
 
     `law = "two-line"` (Shin 2007) takes `stiffness_N_per_mm`;
     `law = "quadratic-toe"` (Blankevoort 1991) takes `stiffness_N_per_strain`.
@@ -122,6 +183,9 @@ class LigamentTable(SceneTable):
         ge=-45,
         le=180,
         description="the recorded frame nearest to this flexion is the reference pose",
+    )
+    wrap: tuple[LigamentWrapTable, ...] = Field(
+        (), description="surfaces that the bundle wraps; default: it is straight"
     )
 
     @model_validator(mode="after")

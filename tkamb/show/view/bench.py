@@ -28,7 +28,6 @@ from tkamb.geometry.frames import (
 from tkamb.io.recordings.ground_reaction import GroundReaction
 from tkamb.io.recordings.tibia import BodyMotion
 from tkamb.io.scene.case import Case
-from tkamb.knee.load import LinkPoint
 from tkamb.show.view.bench_scene import ROWS, STILL, still_motion
 from tkamb.units import DEGREE, MILLIMETRE
 
@@ -242,15 +241,11 @@ class Bench:
     @cached_property
     def bundles(self) -> "tuple[Ligament, ...]":
         """Return all ligaments, each end given in the link of the bone that it is fixed to."""
-        return tuple(
-            replace(one, proximal=self._on_bone(one.proximal), distal=self._on_bone(one.distal))
-            for one in self.ligaments
-        )
-
-    def _on_bone(self, end: LinkPoint) -> LinkPoint:
         chain = self.case.chain
-        link = chain.carrier(end.link)
-        return LinkPoint(link, transform(chain.link_in(end.link, link), end.position))
+        links = {link for one in self.ligaments for link in one.links}
+        carriers = {link: chain.carrier(link) for link in links}
+        placed = {link: (bone, chain.link_in(link, bone)) for link, bone in carriers.items()}
+        return tuple(one.on_links(placed) for one in self.ligaments)
 
     def case_of(self, request: BenchRequest, height: Any = None, like: Case | None = None) -> Case:
         """Return the static case of a request.
@@ -336,22 +331,12 @@ class Bench:
 
     def _bundle(self, bundle: "Ligament", request: BenchRequest) -> "Ligament":
         """Return a bundle after its bones have moved relative to the components."""
+        moved = {"femur": inverse(request.femoral.matrix()), "tibia": self._bone(request)}
         return replace(
-            bundle,
-            proximal=self._end(bundle.proximal, request),
-            distal=self._end(bundle.distal, request),
+            bundle.on_links({link: (link, moved.get(link, np.eye(4))) for link in bundle.links}),
             slack_length=bundle.slack_length * (1.0 + request.slack_percent / 100.0),
             reference_strain=float("nan"),
         )
-
-    def _end(self, end: LinkPoint, request: BenchRequest) -> LinkPoint:
-        if end.link == "femur":
-            position = transform(inverse(request.femoral.matrix()), end.position)
-        elif end.link == "tibia":
-            position = transform(self._bone(request), end.position)
-        else:
-            return end
-        return LinkPoint(end.link, position)
 
 
 def _upright() -> BodyMotion:

@@ -15,13 +15,14 @@ import numpy as np
 from tkamb.contact.materials import MATERIALS, material
 from tkamb.contact.registry import contact_class, contact_names
 from tkamb.errors import InputError
-from tkamb.geometry.frames import KNEE_COORDINATES, Array, inverse, pose, transform
+from tkamb.geometry.frames import KNEE_COORDINATES, Array, inverse, pose
 from tkamb.geometry.surface import Surface
 from tkamb.io.given_material import LAW_KEYS, material_as_json
 from tkamb.io.recordings.motion import KneeMotion
 from tkamb.io.recordings.recording_tables import GroundReactionTable, MotionTable, TibiaTable
 from tkamb.io.recordings.scene_table import SceneTable
 from tkamb.io.scene.case import Case
+from tkamb.io.scene.parts import wrap_table
 from tkamb.io.scene.tables import STIFFNESS_KEYS
 from tkamb.io.starter.person import Person, patient_urdf
 from tkamb.io.toml_text import table_lines
@@ -173,7 +174,7 @@ def ligament_table(bundle: "Ligament", side: float) -> dict[str, Any]:
         return {"link": point.link, "point_mm": [x, y, side * z]}
 
     key, unit = STIFFNESS_KEYS[bundle.law.unit]
-    return {
+    table = {
         "name": bundle.name,
         "proximal": end(bundle.proximal),
         "distal": end(bundle.distal),
@@ -181,6 +182,9 @@ def ligament_table(bundle: "Ligament", side: float) -> dict[str, Any]:
         key: float(bundle.law.stiffness) / unit,
         "slack_length_mm": float(bundle.slack_length) / MILLIMETRE,
     }
+    if bundle.wraps:
+        table["wrap"] = [wrap_table(wrap, side < 0) for wrap in bundle.wraps]
+    return table
 
 
 def still_motion(coordinates: Array) -> KneeMotion:
@@ -241,16 +245,12 @@ def _bundles(knee: Knee, tibia: Array) -> "list[Ligament]":
     """
     bundles: list[Ligament] = []
     for bundle in knee.ligaments:
-        ends = bundle.proximal, bundle.distal
-        if {end.link for end in ends} != {"femur", "tibia"}:
+        if set(bundle.links) != {"femur", "tibia"}:
             logger.warning("%s: not between femur and tibia: not on the bench", bundle.name)
             continue
-        placed = [
-            LinkPoint(end.link, transform(tibia, end.position)) if end.link == "tibia" else end
-            for end in ends
-        ]
+        placed = bundle.on_links({"tibia": ("tibia", tibia), "femur": ("femur", np.eye(4))})
         name = re.sub(r"\W", "_", bundle.name, flags=re.ASCII)
-        bundles.append(replace(bundle, name=name, proximal=placed[0], distal=placed[1]))
+        bundles.append(replace(placed, name=name))
     return bundles
 
 

@@ -223,7 +223,7 @@ def ligament_strands(
     bundles = recording.ligaments
     if not bundles:
         return (), 0.0
-    links = {link for one in bundles for link in (one.proximal.link, one.distal.link)}
+    links = {link for one in bundles for link in one.links}
     poses = {link: np.stack([state.pose(link) for state in states]) for link in links}
     failures = failed(results)
     strains = [np.where(failures, np.nan, one.strain(one.length(poses))) for one in bundles]
@@ -231,8 +231,8 @@ def ligament_strands(
     radius = BUNDLE * (0.5 if len(bundles) > MANY_BUNDLES else 1.0)
     strands = []
     for bundle, strain in zip(bundles, strains, strict=True):
-        points = np.stack(bundle.ends(poses), axis=1)
-        colours = np.repeat(strain_colours(strain, limit)[:, None], 2, axis=1)
+        points = bundle.points(poses)
+        colours = np.repeat(strain_colours(strain, limit)[:, None], points.shape[1], axis=1)
         strands.append(Strand(bundle.name, "ligaments", points, colours, radius))
     return tuple(strands), limit
 

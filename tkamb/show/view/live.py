@@ -104,7 +104,7 @@ class LiveAnswer:
         triangles: (k, 3) indices into the points.
         pressure: (n,) Pa, pressure at the points.
         gap: (n,) m, distance between the surfaces at the points.
-        ligaments: name -> (2, 3) m, ends of the ligament, insert frame.
+        ligaments: name -> (n, 3) m, points along the ligament, insert frame.
         centres: side -> (3,) m, centre of pressure, insert frame.
         error: known error of the contact model for this contact, or "not measured: ...".
     """
@@ -368,17 +368,18 @@ class LiveKnee:
         if frame.equilibrium is None:
             lifted = result.pose @ np.linalg.inv(knee_pose(case.motion.coordinates[0]))
             poses["femur"] = lifted @ poses["femur"]
-        ends = {one.name: np.stack(one.ends(poses)) for one in recording.ligaments}
+        paths = {one.name: one.points(poses) for one in recording.ligaments}
+        lengths = {one.name: float(one.length(poses)) for one in recording.ligaments}
         return LiveAnswer(
             request,
-            _numbers(frame, recording, ends),
+            _numbers(frame, recording, lengths),
             "; ".join(frame.flags) or "ok",
             result.pose,
             state.points,
             state.triangles,
             result.pressure,
             result.gap,
-            ends,
+            paths,
             {
                 side: getattr(result, side).centre_of_pressure
                 for side in SIDES
@@ -399,7 +400,7 @@ class LiveKnee:
         return as_json(stated_error(request.contact, request.resolution_mm, material, options, at))
 
 
-def _numbers(frame: Frame, recording: Recording, ends: dict[str, Array]) -> dict[str, float]:
+def _numbers(frame: Frame, recording: Recording, lengths: dict[str, float]) -> dict[str, float]:
     """Return name -> number. Numbers that results.csv also has use its column names."""
     result = frame.contact
     assert result is not None
@@ -422,8 +423,7 @@ def _numbers(frame: Frame, recording: Recording, ends: dict[str, Array]) -> dict
     for name, tension in frame.geometry.tensions.items():
         numbers[f"ligament_{name}_N"] = tension
     for bundle in recording.ligaments:
-        proximal, distal = ends[bundle.name]
-        strain = bundle.strain(np.linalg.norm(distal - proximal))
+        strain = bundle.strain(lengths[bundle.name])
         numbers[f"ligament_{bundle.name}_strain_percent"] = 100.0 * float(strain)
     if frame.equilibrium is not None:
         places = frame.equilibrium.coordinates

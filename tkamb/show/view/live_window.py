@@ -222,7 +222,7 @@ class LiveWindow:
         answer = self.knee.answer(coarse)
         zeros = np.zeros((1, len(answer.points)))
         hidden = np.full((1, 3), np.nan)
-        colour = np.tile(rgb(SLACK), (1, 2, 1))
+        colour = np.tile(rgb(SLACK), (1, 1, 1))
         return Drawing(
             title="on the bench",
             side=case.scene.patient.side,
@@ -238,7 +238,13 @@ class LiveWindow:
                 Solid(*ghost, recorded),
             ),
             strands=tuple(
-                Strand(one.name, "ligaments", np.full((1, 2, 3), np.nan), colour, 1e-3)
+                Strand(
+                    one.name,
+                    "ligaments",
+                    np.full((1, 2 + 2 * len(one.wraps), 3), np.nan),
+                    np.repeat(colour, 2 + 2 * len(one.wraps), axis=1),
+                    1e-3,
+                )
                 for one in self.knee.bench.bundles
             ),
             arrows=(),

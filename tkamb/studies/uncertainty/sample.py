@@ -35,6 +35,7 @@ from tkamb.knee.frame import FrameStart
 from tkamb.knee.ligaments import Ligament
 from tkamb.knee.load import LinkPoint
 from tkamb.knee.muscles import Muscle, SagittalWrap
+from tkamb.knee.wrap_object import WrapObject
 from tkamb.run.muscles.shared_muscles import SharedMuscles
 from tkamb.run.read_scene import SharedState, recording_of
 from tkamb.run.recording import Recording
@@ -150,6 +151,7 @@ def _ligament(case: Case, bundle: Ligament, draw: Draw) -> Ligament:
         # either the slack length or the reference strain is NaN and remains NaN
         slack_length=bundle.slack_length / (1.0 + strain),
         reference_strain=bundle.reference_strain + strain,
+        wraps=tuple(_wrap_on_femur(case, wrap, draw) for wrap in bundle.wraps),
     )
 
 
@@ -190,6 +192,12 @@ def _on_femur(case: Case, end: LinkPoint, draw: Draw) -> LinkPoint:
         return end
     shift_in_femur = case.chain.link_in(end.link, "femur")[:3, :3].T @ shift
     return LinkPoint(end.link, end.position + shift_in_femur)
+
+
+def _wrap_on_femur(case: Case, wrap: WrapObject, draw: Draw) -> WrapObject:
+    """Return a ligament's surface, moved as `_on_femur` moves its centre."""
+    centre = _on_femur(case, LinkPoint(wrap.body, wrap.pose[:3, 3]), draw).position
+    return replace(wrap, pose=pose(wrap.pose[:3, :3], centre))
 
 
 def thinnable(case: Case) -> bool:

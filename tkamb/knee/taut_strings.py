@@ -1,4 +1,4 @@
-"""Taut strings between two points over wrap objects: cylinder, sphere, ellipsoid, torus.
+"""Taut strings between two points over wrap objects (`tkamb.knee.wrap_object`).
 
 The strings around a single object are computed in its frame, many strings at once. A string touches
 an object if the straight line would pass through it. If the half of a cylinder is prescribed, a
@@ -33,8 +33,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from tkamb.geometry.frames import Array, Index, Mask, inverse
-from tkamb.io.opensim.geodesic import dot, shortest_strings, unit
-from tkamb.io.opensim.model import WrapObject
+from tkamb.knee.geodesic import dot, shortest_strings, unit
+from tkamb.knee.wrap_object import WrapObject
+from tkamb.knee.wrapping import is_inside, taut_path
 
 # Number of angles on a torus's ring at which the string is tried. Chosen as one every 7.5 deg.
 RING_PLACES = 48
@@ -78,6 +79,9 @@ def touch(wrap: WrapObject, start: Array, end: Array, moves: Mask) -> WrapTouch:
         return _sphere(start, end, wrap.dimensions[0], wrap.quadrant)
     if wrap.shape == "torus":
         return _torus(start, end, *wrap.dimensions)
+    if wrap.shape == "section":
+        assert wrap.outline is not None
+        return _section(start, end, wrap.outline)
     return _ellipsoid(start, end, np.array(wrap.dimensions), wrap.quadrant, moves)
 
 
@@ -171,6 +175,40 @@ def _sphere(start: Array, end: Array, radius: float, quadrant: tuple[int, int] |
         for a in (ahead, ahead + turn)
     )
     return WrapTouch(touches, entry, leave, radius * np.abs(turn), _no_push(start))
+
+
+def _section(start: Array, end: Array, outline: Array) -> WrapTouch:
+    """Return strings in front of a convex outline (n, 2), m, that is extruded along z.
+
+    A string with an end inside the outline does not touch.
+    """
+    entry, leave, arc = start.copy(), end.copy(), np.zeros(len(start))
+    touches = np.zeros(len(start), bool)
+    for k in range(len(start)):
+        if is_inside(start[k], outline) or is_inside(end[k], outline):
+            continue
+        path = taut_path(start[k], end[k], outline)
+        if path.wrapped:
+            touches[k], entry[k], leave[k] = True, path.points[1], path.points[-2]
+            arc[k] = np.linalg.norm(np.diff(path.points[1:-1], axis=0), axis=1).sum()
+    return WrapTouch(touches, entry, leave, arc, _no_push(start))
+
+
+def inside(wrap: WrapObject, points: Array) -> Mask:
+    """Return whether points (f, 3), m, in the object's frame lie where strings ignore the object.
+
+    No string ignores an ellipsoid, because it shrinks, or a torus.
+    """
+    if wrap.shape == "cylinder":
+        radius, length = wrap.dimensions
+        within = np.hypot(points[:, 0], points[:, 1]) < radius
+        return np.asarray(within & (np.abs(points[:, 2]) <= 0.5 * length))
+    if wrap.shape == "sphere":
+        return np.asarray(np.linalg.norm(points, axis=1) < wrap.dimensions[0])
+    if wrap.shape == "section":
+        assert wrap.outline is not None
+        return np.array([is_inside(point, wrap.outline) for point in points], bool)
+    return np.zeros(len(points), bool)
 
 
 def _torus(start: Array, end: Array, ring: float, tube: float) -> WrapTouch:

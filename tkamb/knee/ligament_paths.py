@@ -1,0 +1,110 @@
+"""Taut paths of ligament bundles over surfaces, and their pulls on the links.
+
+Let L be the length of the shortest path over the surfaces (`tkamb.knee.taut_strings`), and T its
+tension. No friction acts, so that T is constant along the path. The wrench on a link is -T dL/dx
+for a displacement x of this link: the tension pulls along the straight parts at their ends and
+presses on a surface where the path meets and leaves it. The sum of all wrenches is zero.
+
+If an end of the path moves into an ellipsoid, the ellipsoid shrinks with this end, so that L is
+continuous. There is no path if an end lies inside a cylinder, a sphere or a section.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tkamb.errors import ComputationError
+from tkamb.geometry.frames import Array, Index, inverse, transform
+from tkamb.knee.string_forces import Tension
+from tkamb.knee.taut_strings import WrappedStrings, inside, strings_over
+
+if TYPE_CHECKING:
+    from tkamb.knee.ligaments import Ligament
+
+
+@dataclass(frozen=True, eq=False)
+class BundlePaths:
+    """Taut paths of a bundle at poses of leading shape (...).
+
+    Args:
+        length: lengths, m, shape (...); NaN if there is no taut path.
+        points: proximal end, points where the path meets and leaves each of w surfaces, distal end,
+            m, shape (..., 2 + 2w, 3). For a surface that is not touched the point before it is
+            repeated.
+        wrenches: link -> force and moment about the origin per newton of tension, shape (..., 6).
+    """
+
+    length: Array
+    points: Array
+    wrenches: dict[str, Array]
+
+
+def bundle_paths(bundle: "Ligament", poses: Mapping[str, Array]) -> BundlePaths:
+    """Return the taut paths of a bundle.
+
+    Args:
+        bundle: a bundle with surfaces.
+        poses: link -> pose of the link in the frame of the result, shape (..., 4, 4).
+    """
+    links, wraps = bundle.links, bundle.wraps
+    placed = np.broadcast_arrays(*(np.asarray(poses[link], float) for link in links))
+    shape, count = placed[0].shape[:-2], len(wraps)
+    flat = {link: pose.reshape(-1, 4, 4) for link, pose in zip(links, placed, strict=True)}
+    ends = np.stack([transform(flat[e.link], e.position) for e in (bundle.proximal, bundle.distal)])
+    objects = np.stack([flat[wrap.body] @ wrap.pose for wrap in wraps], axis=1)
+    rows = np.arange(ends.shape[1])
+    # Every end counts as moving: an ellipsoid shrinks with it, and no string ignores the ellipsoid.
+    strings = strings_over(
+        wraps,
+        objects,
+        ends[0],
+        ends[1],
+        np.tile([wrap.active for wrap in wraps], (len(rows), 1)),
+        np.ones((len(rows), count, 2), bool),
+    )
+    bodies = np.array([links.index(wrap.body) for wrap in wraps])
+    at_ends = np.array([links.index(e.link) for e in (bundle.proximal, bundle.distal)])
+    work = Tension(np.stack([*ends], axis=1), np.zeros(2, int), at_ends, (1, len(links)))
+    work.pull_wrapped(rows, 0, np.ones(len(rows), int), strings, bodies)
+    work.press_points()
+    lost = np.zeros(len(rows), bool)
+    for w, wrap in enumerate(wraps):
+        back = inverse(objects[:, w])
+        for end in ends:
+            local = np.einsum("fij,fj->fi", back[:, :3, :3], end) + back[:, :3, 3]
+            lost |= inside(wrap, local) & wrap.active
+    length = np.where(lost, np.nan, work.lengths.sum(axis=1))
+    # `Tension` has the moment above the force.
+    wrench = np.roll(work.wrenches[:, 0], 3, axis=-1)
+    return BundlePaths(
+        length.reshape(shape),
+        _points(ends, strings, rows).reshape(*shape, 2 + 2 * count, 3),
+        {link: wrench[:, k].reshape(*shape, 6) for k, link in enumerate(links)},
+    )
+
+
+def taut_wrenches(bundle: "Ligament", poses: Mapping[str, Array]) -> tuple[Array, dict[str, Array]]:
+    """Return the tension (...), N, and link -> force and moment (..., 6) about the origin.
+
+    Raises:
+        ComputationError: there is no taut path at one of the poses.
+    """
+    paths = bundle_paths(bundle, poses)
+    if np.isnan(paths.length).any():
+        names = ", ".join(wrap.name for wrap in bundle.wraps)
+        raise ComputationError(f"no taut path over {names}", f"ligament {bundle.name}")
+    tension = bundle.force(paths.length)
+    return tension, {link: tension[..., None] * one for link, one in paths.wrenches.items()}
+
+
+def _points(ends: Array, strings: WrappedStrings, rows: Index) -> Array:
+    """Return the points (f, 2 + 2w, 3) of `BundlePaths`."""
+    place, points = ends[0], [ends[0]]
+    for gap in range(strings.order.shape[1]):
+        touched = strings.order[:, gap]
+        for at in (strings.entry, strings.exit):
+            place = np.where((touched >= 0)[:, None], at[rows, touched], place)
+            points.append(place)
+    return np.stack([*points, ends[1]], axis=1)
