@@ -11,14 +11,14 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from tkamb.errors import InputError
 from tkamb.files import MEGABYTE, read_text
-from tkamb.geometry.frames import Array
 from tkamb.units import MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.geometry.frames import Array
 
 
 @dataclass(frozen=True)
@@ -105,14 +105,16 @@ def toml_value(value: Any, decimals: int | None = None) -> str:
         value: the value.
         decimals: number of decimals of floating-point numbers; None: all that they need.
     """
+    if hasattr(value, "tolist"):  # an array or number of NumPy, which is not imported here:
+        value = value.tolist()  # `main` sets the threads of BLAS before NumPy is loaded
     if isinstance(value, str | Path):
         return json.dumps(str(value), ensure_ascii=False)
     if isinstance(value, Mapping):
         pairs = (f"{key} = {toml_value(one, decimals)}" for key, one in value.items())
         return f"{{ {', '.join(pairs)} }}"
-    if isinstance(value, list | tuple | np.ndarray):
+    if isinstance(value, list | tuple):
         return f"[{', '.join(toml_value(one, decimals) for one in value)}]"
-    if isinstance(value, bool | np.bool_ | int | np.integer):
+    if isinstance(value, bool | int):
         return str(value).lower()
     # the sum has no negative zero
     return (
@@ -125,7 +127,7 @@ def table_lines(name: str, values: Mapping[str, Any]) -> list[str]:
     return [name, *(f"{key} = {toml_value(value)}" for key, value in values.items()), ""]
 
 
-def toml_mm(point: Array) -> str:
+def toml_mm(point: "Array") -> str:
     """Return a point (3,) m as TOML, in mm with three decimals."""
     return toml_value(point / MILLIMETRE, 3)
 
@@ -136,6 +138,6 @@ def toml_key(label: str, whole: bool = False) -> str:
     return plain if re.fullmatch(r"[A-Za-z0-9_-]+", plain) else toml_value(plain)
 
 
-def toml_markers(points: Mapping[str, Array], whole: bool = False) -> str:
+def toml_markers(points: Mapping[str, "Array"], whole: bool = False) -> str:
     """Return an inline table of marker positions, mm. Keys have the labels' prefixes if `whole`."""
     return toml_value({toml_key(k, whole): p / MILLIMETRE for k, p in points.items()}, 3)
