@@ -56,6 +56,19 @@ def test_a_search_that_ends_near_the_last_frame_is_not_repeated():
     assert knee.searches == 1
 
 
+def test_a_knee_that_fails_at_the_last_place_is_searched_from_the_recorded_pose():
+    """A femur that slid in an unloaded frame does not take the patella from all later frames."""
+
+    class Slid(Wells):
+        def find(self, instant, start, points=None, before=None):
+            found = super().find(instant, start, points, before)
+            return replace(found, problem="patella lost" if found.coordinates[0] > 5e-3 else "")
+
+    result = equilibrium_of_frame(Slid(0.0, 20e-3), 0.0, 20e-3)
+    assert (result.problem, result.coordinates[0]) == ("", 0.0)
+    assert equilibrium_of_frame(Slid(20e-3), 0.0, 20e-3).problem == "patella lost"
+
+
 def test_a_second_equilibrium_is_reported():
     result = equilibrium_of_frame(Wells(0.0, 20e-3), 20e-3, 3e-3)
     assert result.coordinates[0] == 0.0

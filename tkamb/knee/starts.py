@@ -96,7 +96,7 @@ class InitialPoses:
             except ComputationError as error:
                 failure = error.what
                 continue
-            if knee.balance.status not in ASTRAY and not (knee.problem and instant.muscles):
+            if knee.balance.status not in ASTRAY and not knee.problem:
                 break
         if knee is None:
             raise ComputationError(failure)
