@@ -24,7 +24,7 @@ from tkamb.show.panels import Line, Panel, panels
 from tkamb.show.plots import WIDTH, Sheet, plot
 from tkamb.show.pressure_maps import draw_maps, mapped_frames, top_view
 from tkamb.show.report import THIRD, report_html, write_report
-from tkamb.show.sections import flag_rows, motion_table, reasons
+from tkamb.show.sections import flag_rows, lead, motion_table, reasons
 from tkamb.show.style import BLACK, PRESSURE_MAP, svg_text
 
 VOID = {"meta", "br", "input", "img", "link", "hr"}
@@ -184,6 +184,17 @@ def test_headline_numbers_equal_the_columns(bend, gait):
     (card,) = (one for one in made if one.title == "Peak contact pressure")
     assert card.value == f"{1.1 * peak:.1f} ({0.9 * peak:.1f}–{1.2 * peak:.1f}) MPa"
     assert f"with the inputs as given it is {peak:.1f} MPa" in card.detail
+    ends = {"p05": 0.9, "p50": 1.1, "p95": 1.2}
+    bands = {f"force_si_N_{end}": factor * bend["force_si_N"] for end, factor in ends.items()}
+    banded, axis = replace(bend, bands=bands), horizontal_axis(bend)
+    force = bend["force_si_N"].max() / metrics.body_weight(bend)
+    (card,) = (one for one in cards(banded, axis) if one.title.startswith("Peak forces"))
+    assert card.value.startswith(f"total {1.1 * force:.2f}")
+    line = lead(banded, axis)[0][1]
+    assert line.startswith(f"Total {1.1 * force:.2f} BW")
+    assert (
+        f"{0.9 * force:.2f}–{1.2 * force:.2f} BW; {force:.2f} BW with the inputs as given" in line
+    )
     assert shown["Medial share of the load"].value == "50–58 %"
     assert shown["Frames computed"].value == "101 of 101"
     shown = {card.title: card for card in cards(gait, horizontal_axis(gait))}

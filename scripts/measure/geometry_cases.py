@@ -132,7 +132,7 @@ def geometries() -> Iterator[Geometry]:
     yield Geometry("facets of 6 deg", _level(6), 400.0, facet=6.0)
     yield Geometry("facets of 10 deg", _level(6), 400.0, facet=10.0)
     yield Geometry("stepped top", lambda x, z: 6.0 - 0.4 * (x > 1.0), 400.0, place=(-0.5, 0.2))
-    yield Geometry("post nearby", lambda x, z: 5.0 + 4.0 * (x > 4.0), 400.0, 9.0, place=(-0.3, 0.2))
+    yield Geometry("post nearby", lambda x, z: 5.0 + 4.0 * (x > 4.0), 120.0, 5.0, place=(-1.5, 0.2))
     for varus in (0.15, -0.15):
         yield Geometry(
             f"two balls, {varus:+g} deg", lambda x, z: 5.0 + (abs(z) - 6.0) ** 2 / 60.0, 700.0,
