@@ -160,10 +160,8 @@ class ElasticFoundation(ContactModel):
         The search evaluates only the columns near the femoral component. At its end all columns are
         evaluated. If their reaction differs, the search is repeated with all columns.
         """
-        nearby, unloaded = (
-            _NearColumns(self.law, state, pose, guess),
-            -state.pair.femoral.curved.sag,
-        )
+        nearby = _NearColumns(self.law, state, pose, guess)
+        unloaded = -state.pair.femoral.curved.sag
         result = press_by_search(self, state, load, pose, guess, nearby.reaction, unloaded)
         if result.status is ContactStatus.OK and result.residual <= PRESS.load_tolerance:
             return result

@@ -10,7 +10,6 @@ import numpy as np
 from tkamb.contact.pair import ContactPair
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_pose
-from tkamb.knee.balance import BalanceStatus
 from tkamb.knee.instant import Instant
 from tkamb.knee.released import KneeEquilibrium, ReleasedKnee
 from tkamb.knee.released_forces import SCALE
@@ -18,13 +17,6 @@ from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.contact.cam_post import CamPost
-
-ASTRAY = (
-    BalanceStatus.OUT_OF_RANGE,
-    BalanceStatus.NOT_CONVERGED,
-    BalanceStatus.RUNS_AWAY,
-)
-"""Failures after which another initial guess is tried."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +62,7 @@ class InitialPoses:
     def equilibrium(
         self, instant: Instant, previous: Sequence[KneeEquilibrium], points: dict[str, Array]
     ) -> KneeEquilibrium:
-        """Return the equilibrium from the first initial guess from which the search converges.
+        """Return the equilibrium from the first initial guess from which the search succeeds.
 
         If the equilibrium is farther than `INITIAL_POSE.max_continuation` from that guess, the
         search is repeated from other guesses. If such a search ends at another equilibrium,
@@ -96,7 +88,7 @@ class InitialPoses:
             except ComputationError as error:
                 failure = error.what
                 continue
-            if knee.balance.status not in ASTRAY and not knee.problem:
+            if not knee.problem:
                 break
         if knee is None:
             raise ComputationError(failure)
