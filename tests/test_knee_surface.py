@@ -137,7 +137,7 @@ def test_failure_is_a_bool_a_status_and_a_sentence(read):
     result = knee.press(motion.q[60], 1e6)
     assert result.failed is True and result.status is ContactStatus.OUT_OF_RANGE
     assert "1e+06 N cannot be reached" in result.reason
-    assert " mm deep, at most " in result.reason
+    assert " mm after the first touch a column of " in result.reason
     assert knee.press(motion.q[60], 500.0).failed is False
     found = knee.equilibrium(*at(read, 60))
     assert found.failed is False and found.status.name == "OK" and found.reason == ""

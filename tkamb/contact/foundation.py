@@ -135,8 +135,13 @@ class ElasticFoundation(ContactModel):
             thickness = max(float(samples.thickness[k]), LEAST_THICKNESS)
             # No ray ends in a column that lies wholly inside the femur: its gap is -inf.
             depth = -gap[k] if np.isfinite(gap[k]) else state.pair.approach(pose)
-            limit = DEEPEST * thickness / MILLIMETRE
-            measured = f"{words}: {depth / MILLIMETRE:.2f} mm deep, at most {limit:.2f} mm"
+            depth, limit = depth / MILLIMETRE, DEEPEST * thickness / MILLIMETRE
+            measured = f"{words}: {depth:.2f} mm deep, at most {limit:.2f} mm"
+            if depth < limit:
+                measured = (
+                    f"{words}: {depth:.2f} mm after the first touch a column of "
+                    f"{thickness / MILLIMETRE:.2f} mm lies wholly inside it"
+                )
             return ContactResult.out_of_range(state, pose, measured)
         pressure = layer_pressure(self.law, state.pair.material, strain)
         pressure[grazing(samples, meeting)] = 0.0
