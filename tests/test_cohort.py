@@ -392,6 +392,7 @@ def test_the_page_shows_designs_and_the_known_error_of_the_contact_model(two_by_
     assert "Designs side by side" in page
     assert "foundation at 2 mm, polyethylene: In" in page
     assert "errors of the contact model alone" in page
+    assert "Error of this method: squat" in page and "peak 0.90, RMS 0.47 BW" in page
 
 
 def test_gait_is_binned_by_cycle_without_frames_outside_the_cycle(file):

@@ -161,7 +161,7 @@ def test_an_arrow_has_the_colour_of_its_curve(bend):
     drawn = style.FORCE_COLOURS
     assert drawn["medial condyle"] == curves["medial"]
     assert drawn["lateral condyle"] == curves["lateral"]
-    assert drawn["knee"] == curves["total"]
+    assert drawn["knee"] == curves["resultant"]
     for name in ("quadriceps", "patellar ligament", "patellofemoral"):
         assert drawn[name] == curves[name]
     assert len(set(drawn.values())) == len(drawn)

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from tkamb.geometry.frames import Array
 from tkamb.io.given_material import given_material, material_as_json
+from tkamb.run.claims import method_error
 from tkamb.run.known_errors import as_json, is_large, known_error_words
 from tkamb.run.maps import ContactMaps
 from tkamb.show.headline import OTHER_ERRORS, PRESSURE_AND_AREA, Card
@@ -145,11 +146,27 @@ def _cards(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Gro
     if f"{means[low]:.2f}" == f"{means[high]:.2f}":
         value, detail = f"{means[low]:.2f} BW", "alike in all groups"
     result.append(Card("Peak resultant contact force", value, f"mean of the runs' peaks: {detail}"))
+    result += _method_cards(cohort, outcomes)
     error = _error_card(cohort, outcomes)
     result += [] if error is None else [error]
     if cohort.table.wear is not None:
         result.append(_wear_card(outcomes, groups))
     return result
+
+
+def _method_cards(cohort: Cohort, outcomes: Mapping[int, Outcome]) -> list[Card]:
+    """Return the measured error of the method for each activity and choice of muscles."""
+    scenes = [cohort.runs[n].scene for n, one in outcomes.items() if not one.reason]
+    cases = dict.fromkeys((one.output.activity, one.muscles is not None) for one in scenes)
+    cards = []
+    for activity, muscles in cases:
+        error = method_error({"activity": activity, "scene_tables": {"muscles": muscles}})
+        known = error.same_activity
+        number = f"peak {abs(error.peak_error):.2f}, RMS {error.rmse('total'):.2f} BW"
+        title = f"Error of this method: {activity or 'activity not stated'}"
+        detail = " ".join(error.sentences)
+        cards.append(Card(title, number if known else "not measured", detail, warning=True))
+    return cards
 
 
 def _wear_card(outcomes: Mapping[int, Outcome], groups: Sequence[Group]) -> Card:

@@ -80,8 +80,6 @@ class Panel:
         level: (value, label) of a horizontal reference line; None: no line.
         span: (low, high, label) of a shaded range behind the curves; None: no range.
         second: (factor, unit) of a second vertical axis on the right; None: no second axis.
-        logarithmic: whether the vertical axis is logarithmic.
-        from_zero: whether the vertical axis includes zero.
         limits: ends of the vertical axis; None: they follow from the curves.
         warning: whether the note is highlighted as a warning.
     """
@@ -94,8 +92,6 @@ class Panel:
     level: tuple[float, str] | None = None
     span: tuple[float, float, str] | None = None
     second: tuple[float, str] | None = None
-    logarithmic: bool = False
-    from_zero: bool = True
     limits: tuple[float, float] | None = None
     warning: bool = False
 
@@ -105,7 +101,7 @@ def panels(results: "Results") -> tuple[Panel, ...]:
     makers: tuple[Callable[[Results], Panel], ...] = (
         _total, _condyles, _share, _sensitivity, _extensor, _ratios, _areas, _pressures, _yield,
         _post, _external, _ground, _ligaments, _residuals, _residual_moment, _hip_force,
-        _hip_moment, _motion, _slip, _adjustment, _adjustment_effect, _condition,
+        _hip_moment, _motion, _slip, _adjustment, _adjustment_effect,
     )  # fmt: skip
     panels_made = (_without_empty_lines(make(results)) for make in makers)
     return tuple(panel for panel in panels_made if panel.lines)
@@ -177,7 +173,7 @@ def _both_sides(
 
 def _total(results: "Results") -> Panel:
     scale = 1 / body_weight(results)
-    total = _line(results, "force_total_BW", "total", BLACK)
+    total = _line(results, "force_total_BW", "resultant", BLACK)
     parts = _components(results, "force", "N", scale)
     lines = (total, replace(parts[0], label="superior–inferior", dashed=True), *parts[1:])
     lines += (_measured(results, "total", "measured, axial", BLACK),)
@@ -443,13 +439,3 @@ def _adjustment_effect(results: "Results") -> Panel:
     )
     note = "Adjusted minus recorded pose. A frame is flagged if its total changes by > 0.01 BW."
     return Panel("adjustment_effect", "Effect of the adjustment", "BW or share", lines, note)
-
-
-def _condition(results: "Results") -> Panel:
-    lines = (_line(results, "condition_number", "condition number", BLACK),)
-    note = (
-        "A relative error of the known loads grows at most by this factor in the computed forces. "
-        "The columns of the equations are scaled to unit length."
-    )
-    title = "Condition number of the equilibrium"
-    return Panel("condition", title, "–", lines, note, logarithmic=True, from_zero=False)

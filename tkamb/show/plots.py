@@ -6,11 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import (
-    LogLocator,
     MaxNLocator,
     MultipleLocator,
-    NullFormatter,
-    StrMethodFormatter,
 )
 
 from tkamb.errors import InputError
@@ -275,17 +272,11 @@ def _label_axes(axes: Axes, panel: Panel, axis: HorizontalAxis) -> None:
 
 
 def _scale_vertically(axes: Axes, panel: Panel) -> None:
-    if panel.logarithmic:
-        axes.set_yscale("log")
-        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        axes.yaxis.set_minor_formatter(NullFormatter())
-        return
     axes.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 2.5, 5, 10]))
     drawn = [line.values for line in panel.lines]
     drawn += [one.band.ravel() for one in panel.lines if one.band is not None and not one.dashed]
     values = [one[np.isfinite(one)] for one in drawn]
-    values.append(np.zeros(int(panel.from_zero)))
+    values.append(np.zeros(1))
     values.append(np.array(panel.level[:1] if panel.level else ()))
     values.append(np.array(panel.span[:2] if panel.span else ()))
     low, high = (float(f(np.concatenate(values))) for f in (np.min, np.max))
@@ -293,8 +284,7 @@ def _scale_vertically(axes: Axes, panel: Panel) -> None:
         low, high = panel.limits
     span = high - low if high > low else 1.0
     axes.set_ylim(low - 0.06 * span, high + 0.04 * span)
-    if low < 0 < high or panel.from_zero:
-        axes.axhline(0, color=GREY, linewidth=0.8, zorder=1)
+    axes.axhline(0, color=GREY, linewidth=0.8, zorder=1)
 
 
 def _draw_level(axes: Axes, value: float, label: str) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 
 from tkamb.files import write_text
 from tkamb.geometry.frames import Array
+from tkamb.run.claims import split_of
 from tkamb.run.metrics import body_weight, failed, flagged
 from tkamb.show.axis import (
     EVENLY_SHOWN,
@@ -55,7 +56,7 @@ THIRD = 2 / 3 * WIDTH
 SCRIPTS = ("cursor.js", "units.js", "insert.js", "downloads.js", "start.js")
 """Scripts of the page, in their order."""
 COLOURS = (
-    "Lines run in time order. In every plot blue is medial, orange lateral and black the total. "
+    "Lines run in time order. In every plot blue is medial, orange lateral, black the resultant. "
     "Violet is superior–inferior, teal is anterior–posterior and olive is medial–lateral. A moment "
     "or rotation has the colour of its axis. The colour of a ligament or muscle applies within "
     "one plot only."
@@ -158,6 +159,7 @@ def _maps(results: "Results", axis: HorizontalAxis, sheet: Sheet) -> dict[str, A
         "paths": svg_text(draw_paths(results, view, axis, frames), "paths"),
         "centres": _plot(centre_panel(results), sheet),
         "side": view.side,
+        "apart": split_of(results.columns).estimate == "equilibrium",
     }
 
 

@@ -190,7 +190,7 @@ def _entries(results: "Results", axis: HorizontalAxis) -> list[Entry]:
         unit = "%" if axis.kind == "cycle" else "s"
         digits = 0 if axis.kind == "cycle" else 2
         entries.insert(0, (axis.kind, unit, axis.values, digits))
-    entries.append(("total force", "BW", results["force_total_BW"], 2))
+    entries.append(("resultant force", "BW", results["force_total_BW"], 2))
     split = split_of(results.columns)
     short = {"deformation": "deform.", "equilibrium": "equil."}.get(split.estimate, "")
     for side in ("medial", "lateral"):
