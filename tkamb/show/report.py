@@ -22,6 +22,7 @@ from tkamb.show.axis import (
     results_at,
     shown_frames,
 )
+from tkamb.show.button_maps import draw_button_maps
 from tkamb.show.frame_maps import draw_insert, frame_maps, largest_pressure
 from tkamb.show.headline import cards, run_title
 from tkamb.show.methods import methods
@@ -104,6 +105,7 @@ def report_html(results: "Results", progress: Progress = lambda drawn: drawn) ->
         maps=maps,
         legend=_legend(drawn, drawn_axis, len(results)),
         plots=[_plot(panel, sheet) for panel in progress(panels(drawn))],
+        button=_button(drawn, drawn_axis),
         muscles=_muscles(drawn, drawn_axis),
         wear=wear_section(results),
         motion=motion_table(results, axis),
@@ -159,6 +161,12 @@ def _maps(results: "Results", axis: HorizontalAxis, sheet: Sheet) -> dict[str, A
         "centres": _plot(centre_panel(results), sheet),
         "side": view.side,
     }
+
+
+def _button(results: "Results", axis: HorizontalAxis) -> str | None:
+    """Return the pictures of pressure on the patellar button; None without maps."""
+    figure = draw_button_maps(results, axis)
+    return None if figure is None else svg_text(figure, "button")
 
 
 def _muscles(results: "Results", axis: HorizontalAxis) -> dict[str, Any] | None:
