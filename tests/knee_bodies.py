@@ -171,6 +171,7 @@ def other_knee(plain, model, left, plane):
         replace(item, proximal=moved(item.proximal, left), distal=moved(item.distal, left))
         for item in plain.ligaments
     ]
+    button_contact = plain.button_contact
     muscle, line = plain.extensor.quadriceps, plain.extensor.patellar_ligament
     extensor = tkamb.Extensor(
         replace(muscle, points=tuple(moved(point, left) for point in muscle.points)),
@@ -188,4 +189,5 @@ def other_knee(plain, model, left, plane):
         friction=plain.friction,
         frames=NAMES,
         joints=["knee_free"],
+        patellofemoral_contact=None if button_contact is None else button_contact.contact.model,
     )

@@ -287,7 +287,8 @@ JOURNAL = ".tkamb-commit"
 CHOOSE_OUT = "choose another --out, or remove it"
 OUTPUT_NAMES = frozenset(
     (
-        *("results.csv", "results.csv-metadata.json", "summary.json", "contact.h5", "report.html"),
+        *("results.csv", "results.csv-metadata.json", "summary.json", "contact.h5", "button.h5"),
+        "report.html",
         *("bands.csv", "tornado.csv", "samples.h5", "indices.csv"),
         *("cohort.parquet", "runs.csv", "groups.csv", "cohort.json", "cohort.html"),
         *("wear.csv", "wear.json", "wear.vtp", "worn_insert.stl", "wear.png", ".wear.npz"),

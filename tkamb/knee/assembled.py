@@ -29,6 +29,7 @@ from tkamb.knee.parts import (
     crossing_and_others,
     extensor_lines,
     placed_insert,
+    prepared_button,
     prepared_contact,
     surfaces_of,
 )
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from tkamb.contact.model import ContactModel, ProbedContact
     from tkamb.contact.result import Guess
     from tkamb.geometry.closest import ClosestPointQuery
+    from tkamb.knee.button import Button
     from tkamb.knee.contact import KneeContact
     from tkamb.knee.extensor import ExtensorLines
     from tkamb.knee.ligaments import Ligament
@@ -72,6 +74,7 @@ class KneeData:
         seen: bytes of the last pose, and the contact at that pose; None: not computed yet.
         start: warm start of the next press, from the last press or evaluation; None: there was
             none.
+        button_start: warm start of the next press of the button; None: there was none.
         knee: identity of the knee that made the data.
     """
 
@@ -80,6 +83,7 @@ class KneeData:
     patella: "PatellaState | None" = None
     seen: "tuple[bytes, ProbedContact] | None" = None
     start: "Guess | None" = None
+    button_start: "Guess | None" = None
     knee: str = ""
 
     def __repr__(self) -> str:
@@ -107,6 +111,7 @@ class AssembledKnee:
         frames: Mapping[str, str | None] | None = None,
         joints: Sequence[str] = (),
         cache: bool = False,
+        patellofemoral_contact: "ContactModel | str | None" = None,
     ) -> None:
         if side not in ("right", "left"):
             raise InputError(f"side {side!r}", "Knee", "give 'right' or 'left'")
@@ -136,6 +141,13 @@ class AssembledKnee:
             # Another knee with the same implant and model shares it, as long as one of them lives.
             self._prepared = prepared_contact(contact, self.implant, self._surfaces, cache)
             self.contact = self._prepared.changed(self.friction)
+        self.button_contact: Button | None = None
+        if patellofemoral_contact is not None:
+            if extensor is None:
+                raise InputError("needs extensor=", "patellofemoral_contact", "give it to the knee")
+            self.button_contact = prepared_button(
+                patellofemoral_contact, self.implant, self._surfaces, self.chain, cache
+            )
         self._identity = _identity(self)
 
     def _set_ligaments(self, bundles: "Iterable[Ligament]") -> None:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from tkamb.geometry.adjustment import Adjustment, AdjustmentSettings
     from tkamb.geometry.surface import Surface
     from tkamb.knee.adjustment import AdjustmentEffect
+    from tkamb.knee.button import ButtonPress
     from tkamb.knee.contact import KneeContact
     from tkamb.knee.knee import Knee
     from tkamb.knee.released import KneeEquilibrium, ReleasedKnee
@@ -70,10 +71,12 @@ class FrameStart:
         contact: warm start of the contact model; None: there is none.
         equilibrium: equilibrium of the released coordinates; None: none are released, or the frame
             failed.
+        button: warm start of the button's contact; None: there is none.
     """
 
     contact: "WarmStart | None" = None
     equilibrium: "KneeEquilibrium | None" = None
+    button: "WarmStart | None" = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +107,8 @@ class Frame:
             contact.
         triangles: triangles of the map, shape (k, 3); None: there is no contact.
         post: contact of cam and post; None: not modelled.
+        button: the button pressed on the femoral component; None: not modelled, or the frame
+            failed.
     """
 
     geometry: KneeGeometry
@@ -125,11 +130,13 @@ class Frame:
     medial: Mask | None = None
     triangles: Index | None = None
     post: "PostContact | None" = None
+    button: "ButtonPress | None" = None
 
     @property
     def next(self) -> FrameStart:
         """The initial guess of the next frame."""
-        return FrameStart(self.start, None if self.problem else self.equilibrium)
+        button = None if self.button is None else self.button.start
+        return FrameStart(self.start, None if self.problem else self.equilibrium, button)
 
     @property
     def pressed(self) -> bool:
@@ -188,7 +195,7 @@ class FrameMethod:
         return replace(self, knee=knee, ready_cam=None)
 
     def prepare(self) -> None:
-        """Prepare the contact, so that its errors occur here.
+        """Prepare the contacts, so that their errors occur here.
 
         Raises:
             InputError: the contact model cannot use the meshes.
@@ -196,6 +203,8 @@ class FrameMethod:
         if self.knee.contact is not None:
             self._state  # noqa: B018
             self.cam  # noqa: B018
+        if self.knee.button_contact is not None:
+            self.knee.button_contact.contact.state  # noqa: B018
 
     @property
     def _contact(self) -> "KneeContact":
@@ -240,12 +249,27 @@ class FrameMethod:
         return InitialPoses(self.search, self._state.pair, self.cam)
 
     def frame(self, instant: Instant, before: Sequence[FrameStart] = ()) -> Frame:
-        """Return loads and contact at an instant.
+        """Return loads and contacts at an instant.
 
         Args:
             instant: the knee at one instant.
             before: starts of the earlier frames, for warm start and initial guess.
         """
+        frame, button = self._knee_frame(instant, before), self.knee.button_contact
+        if button is None or frame.failures or frame.geometry.extensor is None:
+            return frame
+        state = frame.geometry.state
+        size = frame.loads.values.get("patellofemoral", NAN)
+        press = button.pressed(
+            state.pose("femur"),
+            state.pose("patella"),
+            size * frame.geometry.extensor.contact_normal,
+            before[-1].button if before else None,
+        )
+        return replace(frame, button=press)
+
+    def _knee_frame(self, instant: Instant, before: Sequence[FrameStart]) -> Frame:
+        """Return loads and femorotibial contact at an instant."""
         if self.knee.contact is None:
             return self.loads(instant)
         if self.released:

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from tkamb.contact.model import ProbedContact
     from tkamb.contact.result import ContactResult, WarmStart
     from tkamb.knee.balance import BalanceStatus
-    from tkamb.knee.pressed import KneeContactResult
+    from tkamb.knee.pressed import KneeContactResult, KneePatellaResult
     from tkamb.knee.released import KneeEquilibrium
     from tkamb.knee.solution_derivatives import EquilibriumDerivatives, PressDerivatives
 
@@ -126,6 +126,8 @@ class Knee(AssembledKnee):
             joint's frame is not taken for a part unless it is named here.
         joints: expected names of the joints between tibia and femur; empty: no check.
         cache: whether a lattice stores its prepared operators on disk for later runs.
+        patellofemoral_contact: contact model of button and femoral component, or its name; None:
+            the button is rigid. It needs `extensor` and a closed button with a flat back.
 
     Raises:
         InputError: the arguments do not fit together.
@@ -556,6 +558,45 @@ class Knee(AssembledKnee):
         if not result.failed:
             data.start = start
         return result, start
+
+    def press_patella(
+        self, q: Array, force: float, data: KneeData | None = None
+    ) -> "KneePatellaResult":
+        """Return the contact of the patellar button under a patellofemoral force.
+
+        The patella has the pose of q, or that of its equilibrium if q has none. The force acts
+        along the contact normal of the extensor mechanism, as `KneeLoads.patellofemoral`. The
+        button is pressed along its axis (`tkamb.knee.button`).
+
+        Args:
+            q: configuration, shape (nq,).
+            force: patellofemoral force, positive, N.
+            data: data from `create_data`; the last contact is the warm start.
+
+        Raises:
+            InputError: the knee has no patellofemoral contact model, or the force is not positive
+                or not finite.
+            ComputationError: the patella is lost, or the contact model is out of its range.
+        """
+        from tkamb.knee.pressed import patella_of_user
+
+        if self.button_contact is None:
+            raise InputError(
+                "has no patellofemoral contact model", "Knee", "give patellofemoral_contact="
+            )
+        if not (np.isfinite(force) and force > 0):
+            raise InputError(f"force {force} N", "press_patella", "give a positive force")
+        data = self._data(data, contact=False)
+        kinematics = self._kinematics(data, q)
+        patella = self._find_patella(kinematics, data)
+        poses = self._link_poses(kinematics, patella)
+        press = self.button_contact.pressed(
+            poses["femur"], poses["patella"], force * patella.contact_normal, data.button_start
+        )
+        if press.problem:
+            raise ComputationError(press.problem, "press_patella")
+        data.button_start = press.start
+        return patella_of_user(press, poses, self.button_contact.in_patella, self.left)
 
     def evaluate(self, q: Array, data: KneeData | None = None) -> "KneeContactResult":
         """Return the contact at q: pressure, area and forces from the overlap of the bodies.

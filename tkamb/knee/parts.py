@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from tkamb.contact.materials import Material
     from tkamb.contact.model import ContactModel
     from tkamb.contact.pair import ContactPair
+    from tkamb.knee.button import Button
     from tkamb.knee.contact import KneeContact
     from tkamb.knee.extensor import ExtensorLines
     from tkamb.knee.ligaments import BundleArrays, Ligament
@@ -82,6 +83,7 @@ class Implant:
         bearing: "fixed" (bottom glued) or "mobile" (bottom slides).
         placed: True: the insert frame of the results is the frame "insert". False: its origin is
             the centre of the mesh's flat bottom.
+        patella_material: material of the patellar button, as `material`.
     """
 
     femoral: Mesh = None
@@ -90,13 +92,23 @@ class Implant:
     material: "str | Material" = "polyethylene"
     bearing: Literal["fixed", "mobile"] = "fixed"
     placed: bool = False
+    patella_material: "str | Material" = "polyethylene"
 
     @property
     def insert_material(self) -> "Material":
-        """The material as an object."""
-        from tkamb.contact.materials import material
+        """Material of the insert as an object."""
+        return _as_material(self.material)
 
-        return material(self.material) if isinstance(self.material, str) else self.material
+    @property
+    def button_material(self) -> "Material":
+        """Material of the patellar button as an object."""
+        return _as_material(self.patella_material)
+
+
+def _as_material(given: "str | Material") -> "Material":
+    from tkamb.contact.materials import material
+
+    return material(given) if isinstance(given, str) else given
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,22 +321,61 @@ def prepared_contact(
     contact: "ContactModel | KneeContact | str", implant: Implant, surfaces: Surfaces, cache: bool
 ) -> "KneeContact":
     """Return a contact model that is prepared for the surfaces of an implant."""
-    from tkamb.contact.model import ContactModel
     from tkamb.contact.pair import ContactPair
-    from tkamb.contact.registry import contact_model
     from tkamb.knee.contact import KneeContact
 
     if isinstance(contact, KneeContact):
         return contact
+    model = _as_model(contact, "contact", cache)
+    assert surfaces.femoral is not None and surfaces.insert is not None
+    pair = ContactPair(surfaces.femoral, surfaces.insert, implant.insert_material, implant.bearing)
+    return _prepared_pair(model, pair)
+
+
+def prepared_button(
+    contact: "ContactModel | str", implant: Implant, surfaces: Surfaces, chain: Chain, cache: bool
+) -> "Button":
+    """Return a contact model that is prepared for the button and the femoral component.
+
+    Raises:
+        InputError: the button is not closed, or has no flat back.
+    """
+    from tkamb.contact.pair import ContactPair
+    from tkamb.knee.button import Button, button_in_patella, without_pegs
+
+    model = _as_model(contact, "patellofemoral_contact", cache)
+    assert surfaces.femoral is not None and surfaces.button is not None
+    in_patella = button_in_patella(surfaces.button)
+    body = without_pegs(surfaces.button.moved(inverse(in_patella)))
+    pair = ContactPair(surfaces.femoral, body, implant.button_material)
+    # The facets meet in the patella's sagittal plane.
+    pair.__dict__["split"] = float(chain.patella_joint_in_femur[2, 3])
+    return Button(_prepared_pair(model, pair), in_patella)
+
+
+def _as_model(contact: "ContactModel | str", where: str, cache: bool) -> "ContactModel":
+    """Return a contact model, from its name if need be; a lattice without its cache if not `cache`.
+
+    Raises:
+        InputError: it is no contact model.
+    """
+    from tkamb.contact.model import ContactModel
+    from tkamb.contact.registry import contact_model
+
     model = contact_model(contact) if isinstance(contact, str) else contact
     if not isinstance(model, ContactModel):
         raise InputError(
-            f"{model!r} is no contact model", "contact", "give tkamb.contact_model(name) or a name"
+            f"{model!r} is no contact model", where, "give tkamb.contact_model(name) or a name"
         )
     if hasattr(model, "cache") and not cache:
         model = replace(model, cache=False)  # type: ignore[type-var]
-    assert surfaces.femoral is not None and surfaces.insert is not None
-    pair = ContactPair(surfaces.femoral, surfaces.insert, implant.insert_material, implant.bearing)
+    return model
+
+
+def _prepared_pair(model: "ContactModel", pair: "ContactPair") -> "KneeContact":
+    """Return a contact model that is prepared for a pair, or that of another knee with the same."""
+    from tkamb.knee.contact import KneeContact
+
     key = _content(pair, model)
     prepared = None if key is None else _PREPARED.get(key)
     if prepared is None:
@@ -344,7 +395,7 @@ def _content(pair: "ContactPair", model: "ContactModel") -> str | None:
     These are the meshes, material and bearing, the model with its options, and changed settings.
     None: the model cannot be pickled, so that its options are unknown.
     """
-    parts = (model, pair.material, pair.bearing, changed_settings())
+    parts = (model, pair.material, pair.bearing, pair.__dict__.get("split"), changed_settings())
     try:
         digest = hashlib.sha256(pickle.dumps(parts))
     except (pickle.PicklingError, AttributeError, TypeError):

@@ -1,12 +1,18 @@
 """The contact that `tkamb.Knee` returns: in the frames of the user's knee, right or left."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import pinocchio as pin
 
 from tkamb.contact.result import CondyleContact, ContactResult
 from tkamb.errors import InputError
-from tkamb.geometry.frames import MIRROR, mirrored_pose
+from tkamb.geometry.frames import MIRROR, Array, inverse, mirrored_pose
 from tkamb.knee.canonical import mirrored_spatial, se3
+
+if TYPE_CHECKING:
+    from tkamb.knee.button import ButtonPress
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -32,6 +38,50 @@ class KneeContactResult(ContactResult):
     def approach(self) -> float:
         """m, travel along -y since first touch; 0 when apart, NaN when out of range."""
         return self.of_right_knee.approach
+
+
+@dataclass(frozen=True, eq=False)
+class KneePatellaResult:
+    """Contact of the patellar button from `Knee.press_patella`.
+
+    Args:
+        contact: the contact in the button frame: x superior, y from the button's back to its
+            articular surface, z to the patient's right. "Insert" in its names means the button;
+            medial and lateral are the facets.
+        button_in_patella: `pin.SE3`, pose of the button frame in the frame "patella".
+        on_patella: `pin.Force` of the contact on the patella, in the frame "patella".
+        on_femoral: `pin.Force` of the contact on the femoral component, in the frame "femoral".
+        flags: warnings in words.
+    """
+
+    contact: KneeContactResult
+    button_in_patella: Any
+    on_patella: Any
+    on_femoral: Any
+    flags: tuple[str, ...]
+
+
+def patella_of_user(
+    press: "ButtonPress", poses: Mapping[str, Array], in_patella: Array, left: bool
+) -> KneePatellaResult:
+    """Return a press of the button in the frames of the user's knee.
+
+    Args:
+        press: press of a right knee, with a contact.
+        poses: link -> pose (4, 4) in the insert frame.
+        in_patella: pose_button_in_patella (4, 4).
+        left: whether the knee is a left one.
+    """
+    assert press.contact is not None
+    on_patella, femoral = pin.Force(press.on_patella), se3(poses["femur"])
+    # The wrench acts on the pressed patella, and the frame of the patella moves with it.
+    pressed_patella = se3(press.pose @ inverse(in_patella))
+    forces = (pressed_patella.actInv(on_patella), femoral.actInv(-on_patella))
+    if left:
+        in_patella = mirrored_pose(in_patella)
+        forces = tuple(pin.Force(mirrored_spatial(force.vector)) for force in forces)
+    contact = contact_of_user(replace(press.contact, flags=press.flags), left)
+    return KneePatellaResult(contact, se3(in_patella), *forces, press.flags)
 
 
 def contact_of_user(result: ContactResult, left: bool) -> KneeContactResult:

@@ -44,6 +44,7 @@ _RECORDED = "[contact] with adduction not released"
 _MARKERS = "[motion.markers]"
 _ADJUST = "[contact] with adjust = true"
 _MEASURED = "[measured]"
+BUTTON_NEEDS = "[contact.patellofemoral]; without it there is no such column"
 _POST = "[contact] post; without it there is no such column"
 
 LIGAMENT = "ligament_<name>_N"
@@ -327,6 +328,34 @@ COLUMNS: tuple[Column, ...] = (
     Column("measured_total_N", "measured axial force, to compare with force_si_N", _MEASURED),
     Column("measured_medial_N", "measured axial force on the medial condyle", _MEASURED),
     Column("measured_lateral_N", "measured axial force on the lateral condyle", _MEASURED),
+    *(
+        Column(f"button_{name}", meaning, BUTTON_NEEDS, optional=True)
+        for name, meaning in (
+            (
+                "force_N",
+                "contact force on the patellar button, magnitude; its vector is patellofemoral_N "
+                "along the contact normal, except for a force along the patella's z axis",
+            ),
+            ("medial_force_N", "normal force on the medial facet of the button"),
+            ("lateral_force_N", "normal force on the lateral facet of the button"),
+            ("area_mm2", "area in contact of the button"),
+            ("mean_pressure_MPa", "sum of the facets' forces over button_area_mm2"),
+            ("peak_pressure_MPa", "largest pressure of the button's map"),
+            ("cop_si_mm", "centre of pressure, superior of the middle of the button's back"),
+            ("cop_ml_mm", "centre of pressure, z of the button frame from the same point"),
+            ("approach_mm", "travel of the button along its axis since first touch"),
+            (
+                "imbalance_N",
+                "sagittal difference of the contact's force and the patellofemoral force of the "
+                "equations, at the patella's pose; zero in exact equilibrium",
+            ),
+            (
+                "thickness_mm",
+                "thickness of the button, mean of its facets under their centres of pressure",
+            ),
+            ("contact_seconds", "computing time of the button's contact"),
+        )
+    ),
     *(
         Column(f"post_{name}", meaning, _POST, optional=True)
         for name, meaning in (

@@ -91,6 +91,8 @@ def scene_content(scene: "Scene") -> Any:
     """Return the scene as JSON types, with the SHA-256 of the content in place of each path."""
     unused: dict[str, Any] = {"base": True, "output": {"directory"}, "wear": True}
     unused |= {} if scene.material else {"material": True}
+    if scene.contact and scene.contact.patellofemoral is None:  # the hash of earlier releases
+        unused["contact"] = {"patellofemoral"}
     return _with_content(scene.model_dump(exclude=unused))
 
 

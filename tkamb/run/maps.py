@@ -73,7 +73,9 @@ class MapWriter:
         self._stream: NotingFile | None = None
         with self._written():
             if self.path is None:
-                self._file = h5py.File("memory", "w", driver="core", backing_store=False)
+                self._file = h5py.File(
+                    f"memory {id(self)}", "w", driver="core", backing_store=False
+                )
             else:
                 self._stream = NotingFile(self.path)
                 self._file = h5py.File(self._stream, "w")

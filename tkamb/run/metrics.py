@@ -12,6 +12,7 @@ from tkamb.run.status import AGREEMENT
 from tkamb.units import MILLIMETRE, STANDARD_GRAVITY
 
 if TYPE_CHECKING:
+    from tkamb.run.maps import ContactMaps
     from tkamb.run.results import Results
 
 
@@ -172,12 +173,18 @@ def _clean(results: "Results") -> NDArray[np.bool_]:
     return np.array([status == "ok" for status in results.status], bool)
 
 
-def map_rows(results: "Results") -> dict[int, int]:
-    """Return frame -> index of its map, for every frame with a map."""
-    if results.maps is None:
+def map_rows(results: "Results", maps: "ContactMaps | None" = None) -> dict[int, int]:
+    """Return frame -> index of its map, for every frame with a map.
+
+    Args:
+        results: results of a run.
+        maps: maps of the run; None: those of the insert.
+    """
+    maps = results.maps if maps is None else maps
+    if maps is None:
         return {}
-    finite = np.isfinite(results.maps.peaks_Pa)
-    row_at = {float(t): row for row, t in enumerate(results.maps.time_s) if finite[row]}
+    finite = np.isfinite(maps.peaks_Pa)
+    row_at = {float(t): row for row, t in enumerate(maps.time_s) if finite[row]}
     times = [float(time) for time in results["time_s"]]
     return {frame: row_at[time] for frame, time in enumerate(times) if time in row_at}
 

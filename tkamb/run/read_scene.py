@@ -186,8 +186,21 @@ def _knee(case: Case, shared: SharedState | None, contact: "KneeContact | None")
         assert case.patellar_ligament is not None
         solved = scene.patella.motion == "solved"
         extensor = Extensor(muscle, case.patellar_ligament, solved=solved)
+    button = None if table is None else table.patellofemoral
+    patellofemoral = None
+    if button is not None:
+        from tkamb.contact.registry import contact_model_in_mm
+        from tkamb.io.given_material import given_material
+
+        implant = replace(implant, patella_material=given_material({"base": button.material}))
+        patellofemoral = contact_model_in_mm(button.model, button.resolution_mm, button.options)
     return Knee(
-        case.chain.model, implant=implant, extensor=extensor, contact=contact, friction=friction
+        case.chain.model,
+        implant=implant,
+        extensor=extensor,
+        contact=contact,
+        friction=friction,
+        patellofemoral_contact=patellofemoral,
     )
 
 

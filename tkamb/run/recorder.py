@@ -37,8 +37,9 @@ from tkamb.files import (
 )
 from tkamb.geometry.frames import Array
 from tkamb.io.claim import settle
-from tkamb.run.recording import CONTACT_PLACES
+from tkamb.run.recording import BUTTON, CONTACT_PLACES
 from tkamb.run.results_folder import (
+    BUTTON_NAME,
     FOLDER,
     IDENTITY_NAME,
     MAPS_NAME,
@@ -203,7 +204,12 @@ def check_same_run(
         )
 
 
-MAPS = ("pressure", "gap", "nodal_force", "pose", *CONTACT_PLACES)
+_MAP = ("pressure", "gap", "nodal_force", "pose")
+MAPS = {
+    MAPS_NAME: (*_MAP, *CONTACT_PLACES),
+    BUTTON_NAME: tuple(BUTTON + name for name in _MAP),
+}
+"""File of pressure maps -> names of its arrays (`frame_arrays`)."""
 
 
 # s: least time before the first and between later copies of the results. Chosen so that the
@@ -222,21 +228,25 @@ class Recorder:
 
     def __init__(self) -> None:
         self.rows = RowTable()
-        self._writer: MapWriter | None = None
+        self._writers: dict[str, MapWriter] = {}
         self._stack = ExitStack()
 
-    def begin_maps(self, points: Array, triangles: Array, labels: Mapping[str, Any]) -> None:
+    def begin_maps(
+        self, name: str, points: Array, triangles: Array, labels: Mapping[str, Any]
+    ) -> None:
         """Prepare to record pressure maps. A run without contact does not call it.
 
         Args:
+            name: file of the maps, a key of `MAPS`.
             points: map points, m, (n, 3).
             triangles: indices of neighbouring map points, (k, 3).
             labels: attributes of contact.h5.
         """
         from tkamb.run.maps import MapWriter
 
-        self._writer = MapWriter(self._maps_path, points, triangles, labels)
-        self._stack.enter_context(self._writer)
+        path = None if self._maps_folder is None else self._maps_folder / name
+        self._writers[name] = MapWriter(path, points, triangles, labels)
+        self._stack.enter_context(self._writers[name])
 
     def record(self, frame: int, row: Row, contact: dict[str, Array] | None) -> None:
         """Store a finished frame.
@@ -248,12 +258,13 @@ class Recorder:
                 modelled.
         """
         self.rows.add(frame, row)
-        if self._writer is None:
-            return
-        if contact is None:
-            self._writer.append_failed(float(row["time_s"]))
-        else:
-            self._writer.append(float(row["time_s"]), *(contact[name] for name in MAPS))
+        time, arrays = float(row["time_s"]), contact or {}
+        for file, writer in self._writers.items():
+            names = MAPS[file]
+            if names[0] in arrays:
+                writer.append(time, *(arrays[name] for name in names))
+            else:
+                writer.append_failed(time)
 
     def take_earlier(self, frames: range) -> dict[int, dict[str, Array] | None]:
         """Read the finished frames of an earlier run; return frame -> arrays of its contact."""
@@ -277,17 +288,17 @@ class Recorder:
     def finish(self) -> None:
         """Close the maps after the last frame."""
 
-    @property
-    def maps(self) -> "ContactMaps | None":
-        """The pressure maps of the finished frames."""
-        return None if self._writer is None else self._writer.maps
+    def maps(self, name: str) -> "ContactMaps | None":
+        """Return the pressure maps of the finished frames, of a file in `MAPS`; None: not begun."""
+        writer = self._writers.get(name)
+        return None if writer is None else writer.maps
 
     def close(self) -> None:
         """Close the maps."""
         self._stack.close()
 
-    _maps_path: Path | None = None
-    """Path of the growing contact.h5; None: in memory."""
+    _maps_folder: Path | None = None
+    """Folder of the growing maps; None: in memory."""
 
 
 class FolderRecorder(Recorder):
@@ -308,13 +319,15 @@ class FolderRecorder(Recorder):
         super().__init__()
         self._directory = directory
         self._shards = Shards(directory, identity, resume)
-        self._maps_path = self._shards.folder / MAPS_NAME
+        self._maps_folder = self._shards.folder
         self._pause, self._published_at = SHORTEST_PAUSE_SECONDS, clock.perf_counter()
-        self._map_arguments: tuple[Any, ...] | None = None
+        self._map_arguments: dict[str, tuple[Any, ...]] = {}
 
-    def begin_maps(self, points: Array, triangles: Array, labels: Mapping[str, Any]) -> None:
+    def begin_maps(
+        self, name: str, points: Array, triangles: Array, labels: Mapping[str, Any]
+    ) -> None:
         """See `Recorder`. The file is created with the first frame."""
-        self._map_arguments = (points, triangles, labels)
+        self._map_arguments[name] = (points, triangles, labels)
 
     def take_earlier(self, frames: range) -> dict[int, dict[str, Array] | None]:
         """See `Recorder`. Only frames before the first absent frame are read."""
@@ -335,8 +348,9 @@ class FolderRecorder(Recorder):
 
     def _record(self, frame: int, row: Row, contact: dict[str, Array] | None) -> None:
         self._shards.begin()
-        if self._map_arguments is not None and self._writer is None:
-            super().begin_maps(*self._map_arguments)
+        for name, arguments in self._map_arguments.items():
+            if name not in self._writers:
+                super().begin_maps(name, *arguments)
         super().record(frame, row, contact)
 
     keeps_files = True
@@ -345,12 +359,11 @@ class FolderRecorder(Recorder):
         """See `Recorder`."""
         return clock.perf_counter() - self._published_at > self._pause
 
-    @property
-    def maps(self) -> "ContactMaps | None":
-        """The published pressure maps in the output folder."""
+    def maps(self, name: str) -> "ContactMaps | None":
+        """Return the published pressure maps in the output folder; None: not begun."""
         from tkamb.run.maps import ContactMaps
 
-        return None if self._writer is None else ContactMaps(self._directory / MAPS_NAME)
+        return ContactMaps(self._directory / name) if name in self._writers else None
 
     def finish(self) -> None:
         """See `Recorder`."""
@@ -362,9 +375,9 @@ class FolderRecorder(Recorder):
         start = clock.perf_counter()
         results = make_results()
         with interrupt_later(), replaced_together(self._directory) as files:
-            if self._writer is not None:
-                self._writer.flush()
-                shutil.copyfile(self._shards.folder / MAPS_NAME, files.path(MAPS_NAME))
+            for name, writer in self._writers.items():
+                writer.flush()
+                shutil.copyfile(self._shards.folder / name, files.path(name))
             put_numbers(results, files)
             files.remove(REPORT_NAME)
         self._published_at = clock.perf_counter()

@@ -204,11 +204,18 @@ class Recording:
             geometry = self.geometry(k, arrays["equilibrium_coordinates"], patella)
             force, stiffness = arrays["equilibrium_force"], arrays["equilibrium_stiffness"]
             equilibrium = stored_equilibrium(geometry, patella, force, stiffness)
-        return FrameStart(WarmStart(state.pair, pose, state.points, pressure, gap), equilibrium)
+        start, button = WarmStart(state.pair, pose, state.points, pressure, gap), None
+        if self.knee.button_contact is not None and BUTTON + "pose" in arrays:
+            state = self.knee.button_contact.contact.state
+            pose, pressure, gap = (arrays[BUTTON + name] for name in ("pose", "pressure", "gap"))
+            button = WarmStart(state.pair, pose, state.points, pressure, gap)
+        return FrameStart(start, equilibrium, button)
 
 
 RESULT_ARRAYS = ("pose", "pressure", "gap", "nodal_force")
 """Arrays of a contact result that pressure maps and warm starts of resumed runs need."""
+BUTTON = "button_"
+"""Beginning of the names of the same arrays of the button's contact."""
 CONTACT_PLACES = ("contact_points", "contact_normals")
 """Arrays (3, 3) of contact points, m, and unit normals of medial condyle, lateral condyle and
 patella; NaN without contact."""
@@ -227,6 +234,9 @@ def frame_arrays(frame: Frame) -> dict[str, Array] | None:
         points[2] = geometry.extensor.contact_point
         normals[2] = geometry.extensor.contact_normal
     arrays |= zip(CONTACT_PLACES, (points, normals), strict=True)
+    if frame.button is not None and frame.button.contact is not None:
+        for name in RESULT_ARRAYS:
+            arrays[BUTTON + name] = np.asarray(getattr(frame.button.contact, name), float)
     if knee is not None:
         arrays["equilibrium_coordinates"] = knee.coordinates
         arrays["equilibrium_force"] = knee.balance.force

@@ -21,6 +21,7 @@ from tkamb.files import MESH_BYTES, check_replaced, sha256_of
 from tkamb.run.columns import KINDS
 from tkamb.run.identity import CONTACT_CODE, contact_code, overrides_of_run, preset_of_run
 from tkamb.run.results_folder import (
+    BUTTON_NAME,
     CSV_NAME,
     MAPS_NAME,
     METADATA_NAME,
@@ -298,7 +299,8 @@ def pack(directory: str | Path, archive: str | Path) -> int:
         )
     files = [Path(os.path.normpath(folder / name)) for name in summary["inputs"]]
     root = Path(os.path.commonpath([path.parent for path in files]))
-    names = (CSV_NAME, METADATA_NAME, SUMMARY_NAME, MAPS_NAME, REPORT_NAME, *UNCERTAINTY_NAMES)
+    own = (CSV_NAME, METADATA_NAME, SUMMARY_NAME, MAPS_NAME, BUTTON_NAME, REPORT_NAME)
+    names = own + UNCERTAINTY_NAMES
     archive.parent.mkdir(parents=True, exist_ok=True)
     try:
         with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as target:

@@ -45,6 +45,7 @@ class Results:
         maps: pressure maps; None without contact.
         directory: folder of the results; None: in memory only.
         bands: columns of bands.csv; empty if no inputs were varied.
+        button_maps: pressure maps of the patellar button in its own frame; None: not modelled.
 
     Raises:
         InputError: a column is unknown, lengths differ, or time or status is missing.
@@ -55,6 +56,7 @@ class Results:
     maps: "ContactMaps | None" = None
     directory: Path | None = None
     bands: dict[str, Array] = field(default_factory=dict)
+    button_maps: "ContactMaps | None" = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "columns", _complete_columns(self.columns))

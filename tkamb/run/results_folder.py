@@ -33,10 +33,10 @@ if TYPE_CHECKING:
 
 FOLDER = ".frames"
 IDENTITY_NAME = "run.json"
-OWN_NAMES = (IDENTITY_NAME, "contact.h5", "*.frame", ".tkamb-*.part")
+OWN_NAMES = (IDENTITY_NAME, "contact.h5", "button.h5", "*.frame", ".tkamb-*.part")
 """Patterns of the files in `.frames`. No other file is removed from it."""
 CSV_NAME, SUMMARY_NAME, REPORT_NAME = "results.csv", "summary.json", "report.html"
-MAPS_NAME = "contact.h5"
+MAPS_NAME, BUTTON_NAME = "contact.h5", "button.h5"
 METADATA_NAME = "results.csv-metadata.json"
 BANDS_NAME, TORNADO_NAME, SAMPLES_NAME = "bands.csv", "tornado.csv", "samples.h5"
 INDICES_NAME = "indices.csv"
@@ -70,20 +70,28 @@ def read_results(directory: str | Path, *, check: bool = True) -> Results:
         if name in columns and not np.isfinite(np.asarray(columns[name], float)).all():
             raise InputError(f"'{name}' is not a number", directory / CSV_NAME, "run it again")
     summary = read_summary(directory)
-    maps = None
-    if (directory / MAPS_NAME).exists():
-        from tkamb.run.maps import read_maps
-
-        maps = read_maps(directory / MAPS_NAME)
-        frames = len(next(iter(columns.values()), ()))
-        if len(maps) < frames and not summary.get("unfinished_frames"):
-            what = f"has {len(maps)} frames, but {CSV_NAME} has {frames}"
-            raise InputError(what, directory / MAPS_NAME, "run it again")
+    frames, complete = len(next(iter(columns.values()))), not summary.get("unfinished_frames")
+    maps, button = (
+        _read_maps(directory / name, frames if complete else 0) for name in (MAPS_NAME, BUTTON_NAME)
+    )
     if check and (changes := differences(directory, summary)):
         raise InputError(changes[0], directory, "`tkamb verify` lists all changes; run it again")
     has_bands = (directory / BANDS_NAME).exists()
     bands = read_bands(directory / BANDS_NAME) if has_bands else {}
-    return Results(columns, summary, maps, directory, bands)
+    return Results(columns, summary, maps, directory, bands, button)
+
+
+def _read_maps(path: Path, frames: int) -> "ContactMaps | None":
+    """Return the maps of a file with at least some frames; None: no such file."""
+    if not path.exists():
+        return None
+    from tkamb.run.maps import read_maps
+
+    maps = read_maps(path)
+    if len(maps) < frames:
+        what = f"has {len(maps)} frames, but {CSV_NAME} has {frames}"
+        raise InputError(what, path, "run it again")
+    return maps
 
 
 def read_summary(directory: Path) -> dict[str, Any]:
@@ -110,7 +118,7 @@ def differences(directory: Path, summary: Mapping[str, Any]) -> list[str]:
         return []
     if summary.get("summary_sha256") != _summary_hash(summary):
         messages.append(f"{SUMMARY_NAME} has changed since it was written")
-    for name in (CSV_NAME, MAPS_NAME, *UNCERTAINTY_NAMES):
+    for name in (CSV_NAME, MAPS_NAME, BUTTON_NAME, *UNCERTAINTY_NAMES):
         exists = (directory / name).exists()
         if exists and name not in recorded:
             messages.append(f"{name} does not belong to these results")
@@ -148,7 +156,8 @@ def write_results(
         results = replace(results, bands={})  # the report must not show bands without their file
     with claimed_directory(directory, force, "run") as folder:
         with replaced_together(folder) as files:
-            _put_maps(results.maps, files)
+            _put_maps(results.maps, MAPS_NAME, files)
+            _put_maps(results.button_maps, BUTTON_NAME, files)
             for name, write in (more or {}).items():
                 write(files.path(name))
             put_numbers(results, files)
@@ -170,10 +179,11 @@ def put_numbers(results: Results, files: Replacement) -> None:
     write_rows(files.path(CSV_NAME), csv_rows(results.columns))
     write_synced(files.path(METADATA_NAME), table_metadata(results.columns, results.summary))
     recorded = {CSV_NAME: sha256_of(files.path(CSV_NAME))}
-    if results.maps is None:
-        files.remove(MAPS_NAME)
-    else:
-        recorded[MAPS_NAME] = sha256_of(files.current(MAPS_NAME))
+    for name, maps in ((MAPS_NAME, results.maps), (BUTTON_NAME, results.button_maps)):
+        if maps is None:
+            files.remove(name)
+        else:
+            recorded[name] = sha256_of(files.current(name))
     for name in UNCERTAINTY_NAMES:
         if files.current(name) == files.folder / name:  # a file of an earlier run
             files.remove(name)
@@ -204,18 +214,15 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def _put_maps(maps: "ContactMaps | None", files: Replacement) -> None:
-    """Write the maps unless they are the contact.h5 of the folder."""
+def _put_maps(maps: "ContactMaps | None", name: str, files: Replacement) -> None:
+    """Write the maps unless they are the file of this name in the folder."""
     if maps is None:
         return
-    if (
-        isinstance(maps.source, Path)
-        and maps.source.absolute() == files.current(MAPS_NAME).absolute()
-    ):
+    if isinstance(maps.source, Path) and maps.source.absolute() == files.current(name).absolute():
         return
     from tkamb.run.maps import write_maps
 
-    write_maps(maps, files.path(MAPS_NAME))
+    write_maps(maps, files.path(name))
 
 
 def remove_shards(directory: Path, name: str = FOLDER) -> None:

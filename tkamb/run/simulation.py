@@ -22,6 +22,7 @@ from tkamb.run.read_scene import recording_of
 from tkamb.run.recorder import FolderRecorder, Recorder, Row, finished_results
 from tkamb.run.recording import frame_arrays
 from tkamb.run.results import Results
+from tkamb.run.results_folder import BUTTON_NAME, MAPS_NAME
 from tkamb.run.status import frame_status
 from tkamb.run.summary import summary_of
 from tkamb.run.tabulate import frame_row
@@ -270,8 +271,12 @@ class _Run:
     def compute(self, recorder: Recorder, progress: Progress, team: WorkerPool | None) -> Results:
         """Compute the remaining frames and return the results."""
         self.recorder = recorder
-        if (contact := self.solver.recording.knee.contact) is not None:
-            self._begin_maps(contact)
+        knee = self.solver.recording.knee
+        if knee.contact is not None:
+            self._begin_maps(MAPS_NAME, knee.contact, "insert: x anterior, y superior, z lateral")
+        if knee.button_contact is not None:
+            axes = "button: x superior, y from its back to its articular surface, z lateral"
+            self._begin_maps(BUTTON_NAME, knee.button_contact.contact, axes)
         self._take_earlier()
         self.resumed = len(self.recorder.rows)
         remaining = [k for k in self.indices if k not in self.recorder.rows]
@@ -307,7 +312,12 @@ class _Run:
         summary["inputs"] = self.inputs
         summary["resumed_frames"] = self.resumed
         summary["unfinished_frames"] = len(self.indices) - len(self.recorder.rows)
-        results = Results(columns, summary, self.recorder.maps)
+        results = Results(
+            columns,
+            summary,
+            self.recorder.maps(MAPS_NAME),
+            button_maps=self.recorder.maps(BUTTON_NAME),
+        )
         if (largest := peak_pressure(results)) is not None:
             summary["peak_pressure"] = largest
         return results
@@ -322,16 +332,16 @@ class _Run:
         frames = finished_in_order(team, self.solver.slips, self.indices, remaining)
         yield from (frame for _, frame in zip(progress(remaining), frames, strict=True))
 
-    def _begin_maps(self, contact: "KneeContact") -> None:
+    def _begin_maps(self, name: str, contact: "KneeContact", frame: str) -> None:
         labels = {
-            "frame": "insert: x anterior, y superior, z lateral",
+            "frame": frame,
             "model": contact.model.name,
             "version": str(self.identity["version of tkamb"]),
             "scene_sha256": scene_hash(self.case.scene),
             "licence": self.case.scene.output.licence or "not stated",
             "creator": f"tkamb {self.identity['version of tkamb']}",
         }
-        self.recorder.begin_maps(contact.state.points, contact.state.triangles, labels)
+        self.recorder.begin_maps(name, contact.state.points, contact.state.triangles, labels)
 
     def _take_earlier(self) -> None:
         """Read the frames of the run to resume. Its last contacts become initial guesses."""

@@ -174,6 +174,7 @@ def frame_status(
         words.append("several load states are in equilibrium: the one with most loads is used")
     words += contradictions(case, frame)
     words += [*frame.flags, *(frame.post.flags if frame.post else ())]
+    words += frame.button.words if frame.button else ()
     words += question_flags
     if frame.failures:
         return FAILED + "; ".join([*frame.failures, *words])

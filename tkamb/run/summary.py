@@ -29,7 +29,7 @@ from tkamb.run.columns import (
 )
 from tkamb.run.discrepancy import discrepancy_summary
 from tkamb.run.identity import relative_paths, scene_hash
-from tkamb.run.known_errors import ContactSituation, as_json, left_out, stated_error
+from tkamb.run.known_errors import NOT_MEASURED, ContactSituation, as_json, left_out, stated_error
 from tkamb.run.read_scene import STRAIN_FLEXIONS
 from tkamb.run.status import FAILED
 from tkamb.settings import changed_settings
@@ -108,7 +108,12 @@ def summary_of(
         sag = sum(body.facet_sag() for body in (case.femoral, case.insert) if body is not None)
         peak = ContactSituation.of_run(columns, columns["status"], material.poisson_ratio, sag)
         error = stated_error(table.model, table.resolution_mm, material.name, table.options, peak)
-        summary["contact"] = table.model_dump(mode="json")
+        summary["contact"] = table.model_dump(mode="json", exclude={"patellofemoral"})
+        if (button := table.patellofemoral) is not None:
+            summary["patellofemoral_contact"] = button.model_dump(mode="json") | {
+                "known_error": NOT_MEASURED,
+                "peak_pressure_MPa": _peak(columns.get("button_peak_pressure_MPa", np.nan)),
+            }
         if scene.material is not None:
             del summary["contact"]["material"]  # [material] replaces it
         summary["material"] = chosen

@@ -15,6 +15,8 @@ from tkamb.knee.crossing import condyle_contributions
 from tkamb.knee.equations import dome_sensitivity
 from tkamb.run.columns import (
     ACTIVATION,
+    BUTTON_NEEDS,
+    COLUMNS,
     CONTRIBUTIONS,
     JOINT_MOMENT,
     MUSCLE_FORCE,
@@ -28,6 +30,7 @@ from tkamb.units import DEGREE, MEGAPASCAL, MILLIMETRE
 if TYPE_CHECKING:
     from tkamb.contact.cam_post import PostContact
     from tkamb.io.recordings.marker_motion import MarkerKinematics
+    from tkamb.knee.button import ButtonPress
     from tkamb.knee.contact_points import CondylePoint
     from tkamb.knee.crossing import MuscleShare
     from tkamb.knee.frame import Frame
@@ -65,6 +68,8 @@ def frame_row(
     row = motion | _body_row(case, frame)
     for side, slip in slips.items():
         row |= _slip_row(case, k, side, slip, frame.geometry.condyles.get(side))
+    if frame.button is not None:
+        row |= _button_row(frame.button)
     if frame.pressed:
         row |= _contact_row(frame, case.yield_stress)
         row |= _pose_row(frame)
@@ -272,6 +277,32 @@ def _post_row(post: "PostContact") -> dict[str, float]:
         "post_cop_ml_mm": centre[2] / MILLIMETRE,
         "post_gap_mm": post.gap / MILLIMETRE,
     }
+
+
+def _button_row(press: "ButtonPress") -> dict[str, float]:
+    """Return force, area, pressure and place of the button's contact; NaN without contact."""
+    names = [each.name.removeprefix("button_") for each in COLUMNS if each.needs == BUTTON_NEEDS]
+    values = dict.fromkeys(names, NAN) | {"contact_seconds": press.seconds}
+    if press.contact is not None:
+        facets = [facet for facet in press.facets.values() if facet is not None]
+        force, area = (sum(getattr(f, name) for f in facets) for name in ("force", "area"))
+        weights = [facet.force / force for facet in facets]
+        centre = sum(w * f.centre_of_pressure for w, f in zip(weights, facets, strict=True))
+        values |= {
+            "force_N": float(np.linalg.norm(press.on_patella[:3])),
+            "area_mm2": area / MILLIMETRE**2,
+            "mean_pressure_MPa": force / area / MEGAPASCAL,
+            "peak_pressure_MPa": max(f.peak_pressure for f in facets) / MEGAPASCAL,
+            "cop_si_mm": centre[0] / MILLIMETRE,
+            "cop_ml_mm": centre[2] / MILLIMETRE,
+            "approach_mm": press.contact.approach / MILLIMETRE,
+            "imbalance_N": press.imbalance,
+            "thickness_mm": sum(w * f.thickness for w, f in zip(weights, facets, strict=True))
+            / MILLIMETRE,
+        }
+        for side, facet in press.facets.items():
+            values[f"{side}_force_N"] = 0.0 if facet is None else facet.force
+    return {f"button_{name}": value for name, value in values.items()}
 
 
 def _pose_row(frame: "Frame") -> dict[str, float]:

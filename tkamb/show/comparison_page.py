@@ -69,7 +69,7 @@ def determined_share(results: "Results") -> Array:
 
 
 QUANTITIES = (
-    _column("Contact force, total", "BW", "force_total_BW"),
+    _column("Contact force, resultant", "BW", "force_total_BW"),
     Quantity("Medial share by equilibrium", "–", lambda r: medial_share(r, "equilibrium")),
     Quantity("Medial share by deformation", "–", determined_share),
     *_both("Force by equilibrium", "N", "force_equilibrium_N"),
@@ -308,9 +308,11 @@ def _rows(comparison: Comparison, differences: Sequence[Difference]) -> list[lis
 
 def run_lines(comparison: Comparison) -> list[str]:
     """Return lines with each run's peak forces and bands, peak pressure and muscles at a limit."""
-    lines = []
+    lines: list[str] = []
+    said: set[str] = set()
     for run in comparison.runs:
-        words = peak_lines(run.results)
+        words = [one for one in peak_lines(run.results) if one[0] != "(" or one not in said]
+        said.update(words)
         if pressure := metrics.peak_pressure(run.results):
             doubt = f", where {pressure['doubt']}" if pressure["doubt"] else ""
             place = f"{pressure['side']}, at {pressure['time_s']:.4g} s{doubt}"

@@ -100,7 +100,8 @@ def panels(results: "Results") -> tuple[Panel, ...]:
     """Return the plots that have numbers in this run, in the report's order."""
     makers: tuple[Callable[[Results], Panel], ...] = (
         _total, _condyles, _share, _sensitivity, _extensor, _ratios, _areas, _pressures, _yield,
-        _post, _external, _ground, _ligaments, _residuals, _residual_moment, _hip_force,
+        _post, _button_force, _button_area, _button_pressure, _button_centre,
+        _external, _ground, _ligaments, _residuals, _residual_moment, _hip_force,
         _hip_moment, _motion, _slip, _adjustment, _adjustment_effect,
     )  # fmt: skip
     panels_made = (_without_empty_lines(make(results)) for make in makers)
@@ -309,6 +310,43 @@ def _post(results: "Results") -> Panel:
     )
     note = "Force on the insert, without friction. The contact force includes it."
     return Panel("post", "Force of the cam on the post", "BW", lines, note)
+
+
+def _button_force(results: "Results") -> Panel:
+    scale = 1 / body_weight(results)
+    lines = (
+        _line(results, "button_force_N", "total", BLACK, scale=scale),
+        *(
+            _line(results, f"button_{side}_force_N", f"{side} facet", colour, scale=scale)
+            for side, colour in SIDE_COLOURS.items()
+        ),
+    )
+    note = "Forces of the contact on the button, at the pose of the patella."
+    return Panel("button_force", "Force on the patellar button", "BW", lines, note)
+
+
+def _button_pressure(results: "Results") -> Panel:
+    lines = (
+        _line(results, "button_peak_pressure_MPa", "peak", BLACK),
+        _line(results, "button_mean_pressure_MPa", "mean", GREY, True),
+    )
+    note = "The error of the contact model was not measured at the patella."
+    return Panel("button_pressure", "Pressure on the patellar button", "MPa", lines, note)
+
+
+def _button_area(results: "Results") -> Panel:
+    lines = (_line(results, "button_area_mm2", "contact area", BLACK),)
+    return Panel("button_area", "Contact area of the patellar button", "mm²", lines)
+
+
+def _button_centre(results: "Results") -> Panel:
+    right = lateral_axis_name(results)
+    lines = (
+        _line(results, "button_cop_si_mm", "superior", SUPERIOR),
+        _line(results, "button_cop_ml_mm", right, RIGHT),
+    )
+    note = "From the middle of the button's back."
+    return Panel("button_centre", "Centre of pressure on the button", "mm", lines, note)
 
 
 def _external(results: "Results") -> Panel:

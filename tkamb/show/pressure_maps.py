@@ -120,13 +120,13 @@ class TopView:
         axes.set_aspect("equal")
         axes.set_axis_off()
 
-    def draw_labels(self, axes: Axes) -> None:
-        """Draw the labels anterior, medial and lateral, and a scale of 10 mm."""
+    def draw_labels(self, axes: Axes, upward: str = "anterior") -> None:
+        """Draw the labels of the upper side, medial and lateral, and a scale of 10 mm."""
         left, right = ("medial", "lateral") if self.side == "right" else ("lateral", "medial")
         style: Any = {"fontsize": 7.5, "color": GREY, "transform": axes.transAxes}
         axes.text(0.0, -0.01, left, ha="left", va="top", **style)
         axes.text(1.0, -0.01, right, ha="right", va="top", **style)
-        axes.text(0.0, 1.0, "anterior ↑", ha="left", va="top", **style)
+        axes.text(0.0, 1.0, f"{upward} ↑", ha="left", va="top", **style)
         axes.text(1.0, 1.0, self.side[0].upper(), ha="right", va="top", **style)
         low = self.up.min() - 3.0
         axes.plot([-5, 5], [low, low], color=GREY, linewidth=2, clip_on=False)
@@ -324,8 +324,13 @@ def _draw_centres(axes: Axes, view: TopView, results: "Results", frame: int) -> 
         x, y = view.page_coordinates(
             results[f"{side}_cop_ap_mm"][frame], results[f"{side}_cop_ml_mm"][frame]
         )
-        axes.plot(x, y, "+", color="white", markersize=7, markeredgewidth=2.4)
-        axes.plot(x, y, "+", color=BLACK, markersize=6, markeredgewidth=1.1)
+        draw_centre(axes, x, y)
+
+
+def draw_centre(axes: Axes, x: Array, y: Array) -> None:
+    """Draw a centre of pressure at page coordinates, mm."""
+    axes.plot(x, y, "+", color="white", markersize=7, markeredgewidth=2.4)
+    axes.plot(x, y, "+", color=BLACK, markersize=6, markeredgewidth=1.1)
 
 
 def _caption(results: "Results", axis: HorizontalAxis, frame: int) -> str:

@@ -23,6 +23,7 @@ from tkamb.show.axis import (
     results_at,
     shown_frames,
 )
+from tkamb.show.button_maps import draw_button_maps
 from tkamb.show.frame_maps import draw_insert, frame_maps, largest_pressure
 from tkamb.show.headline import cards, run_title
 from tkamb.show.methods import methods
@@ -105,6 +106,7 @@ def report_html(results: "Results", progress: Progress = lambda drawn: drawn) ->
         maps=maps,
         legend=_legend(drawn, drawn_axis, len(results)),
         plots=[_plot(panel, sheet) for panel in progress(panels(drawn))],
+        button=_button(drawn, drawn_axis),
         muscles=_muscles(drawn, drawn_axis),
         wear=wear_section(results),
         motion=motion_table(results, axis),
@@ -161,6 +163,12 @@ def _maps(results: "Results", axis: HorizontalAxis, sheet: Sheet) -> dict[str, A
         "side": view.side,
         "apart": split_of(results.columns).estimate == "equilibrium",
     }
+
+
+def _button(results: "Results", axis: HorizontalAxis) -> str | None:
+    """Return the pictures of pressure on the patellar button; None without maps."""
+    figure = draw_button_maps(results, axis)
+    return None if figure is None else svg_text(figure, "button")
 
 
 def _muscles(results: "Results", axis: HorizontalAxis) -> dict[str, Any] | None:

@@ -349,6 +349,22 @@ class PatellaTable(SceneTable):
     motion: Literal["recorded", "solved"]
 
 
+class PatellofemoralTable(SceneTable):
+    """The contact of the patellar button with the femoral component.
+
+    The patellofemoral force presses the button at the patella's pose. Without this table the button
+    is rigid. The thickness is that of the mesh, which must be closed and have a flat back. Pegs
+    below the back do not deform.
+    """
+
+    model: str = Field("foundation", description="a name of `tkamb contact list`")
+    resolution_mm: Number = Field(0.5, gt=0)
+    material: str = Field("polyethylene", description="a name of `tkamb.contact.materials`")
+    options: dict[str, Any] = Field(
+        default_factory=dict, description="options of the contact model, see `tkamb contact list`"
+    )
+
+
 class ContactTable(SceneTable):
     """The femorotibial contact."""
 
@@ -386,6 +402,9 @@ class ContactTable(SceneTable):
     )
     options: dict[str, Any] = Field(
         default_factory=dict, description="options of the contact model, see `tkamb contact list`"
+    )
+    patellofemoral: PatellofemoralTable | None = Field(
+        None, description="contact of the patellar button; default: the button is rigid"
     )
 
     @model_validator(mode="after")
