@@ -9,9 +9,9 @@ If an end of the path moves into an ellipsoid, the ellipsoid shrinks with this e
 continuous. There is no path if an end lies inside a cylinder, a sphere or a section.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,14 +26,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class BundlePaths:
-    """Taut paths of a bundle at poses of leading shape (...).
+    """Taut paths of n bundles at poses of leading shape (...).
 
     Args:
-        length: lengths, m, shape (...); NaN if there is no taut path.
+        length: lengths, m, shape (n, ...); NaN if there is no taut path.
         points: proximal end, points where the path meets and leaves each of w surfaces, distal end,
-            m, shape (..., 2 + 2w, 3). For a surface that is not touched the point before it is
+            m, shape (n, ..., 2 + 2w, 3). For a surface that is not touched the point before it is
             repeated.
-        wrenches: link -> force and moment about the origin per newton of tension, shape (..., 6).
+        wrenches: link -> force and moment about the origin per newton of tension, shape
+            (n, ..., 6).
     """
 
     length: Array
@@ -41,19 +42,24 @@ class BundlePaths:
     wrenches: dict[str, Array]
 
 
-def bundle_paths(bundle: "Ligament", poses: Mapping[str, Array]) -> BundlePaths:
-    """Return the taut paths of a bundle.
+def bundle_paths(bundles: Sequence["Ligament"], poses: Mapping[str, Array]) -> BundlePaths:
+    """Return the taut paths of bundles between the same two links over the same surfaces.
 
     Args:
-        bundle: a bundle with surfaces.
+        bundles: n bundles with surfaces.
         poses: link -> pose of the link in the frame of the result, shape (..., 4, 4).
     """
-    links, wraps = bundle.links, bundle.wraps
+    links, wraps = bundles[0].links, bundles[0].wraps
     placed = np.broadcast_arrays(*(np.asarray(poses[link], float) for link in links))
-    shape, count = placed[0].shape[:-2], len(wraps)
+    shape, count = (len(bundles), *placed[0].shape[:-2]), len(wraps)
     flat = {link: pose.reshape(-1, 4, 4) for link, pose in zip(links, placed, strict=True)}
-    ends = np.stack([transform(flat[e.link], e.position) for e in (bundle.proximal, bundle.distal)])
+    of_ends = [(bundle.proximal, bundle.distal) for bundle in bundles]
+    ends = np.stack(
+        [np.concatenate([transform(flat[e.link], e.position) for e in one])
+         for one in zip(*of_ends, strict=True)]
+    )  # fmt: skip
     objects = np.stack([flat[wrap.body] @ wrap.pose for wrap in wraps], axis=1)
+    objects = np.tile(objects, (len(bundles), 1, 1, 1))
     rows = np.arange(ends.shape[1])
     # Every end counts as moving: an ellipsoid shrinks with it, and no string ignores the ellipsoid.
     strings = strings_over(
@@ -65,7 +71,7 @@ def bundle_paths(bundle: "Ligament", poses: Mapping[str, Array]) -> BundlePaths:
         np.ones((len(rows), count, 2), bool),
     )
     bodies = np.array([links.index(wrap.body) for wrap in wraps])
-    at_ends = np.array([links.index(e.link) for e in (bundle.proximal, bundle.distal)])
+    at_ends = np.array([links.index(end.link) for end in of_ends[0]])
     work = Tension(np.stack([*ends], axis=1), np.zeros(2, int), at_ends, (1, len(links)))
     work.pull_wrapped(rows, 0, np.ones(len(rows), int), strings, bodies)
     work.press_points()
@@ -85,18 +91,34 @@ def bundle_paths(bundle: "Ligament", poses: Mapping[str, Array]) -> BundlePaths:
     )
 
 
-def taut_wrenches(bundle: "Ligament", poses: Mapping[str, Array]) -> tuple[Array, dict[str, Array]]:
-    """Return the tension (...), N, and link -> force and moment (..., 6) about the origin.
+def taut_wrenches(
+    bundles: Sequence["Ligament"], poses: Mapping[str, Array]
+) -> tuple[Array, dict[str, Array]]:
+    """Return tensions (n, ...), N, and link -> forces and moments (n, ..., 6) about the origin.
+
+    Bundles between the same links over the same surfaces are computed together.
 
     Raises:
-        ComputationError: there is no taut path at one of the poses.
+        ComputationError: a bundle has no taut path at one of the poses.
     """
-    paths = bundle_paths(bundle, poses)
-    if np.isnan(paths.length).any():
-        names = ", ".join(wrap.name for wrap in bundle.wraps)
-        raise ComputationError(f"no taut path over {names}", f"ligament {bundle.name}")
-    tension = bundle.force(paths.length)
-    return tension, {link: tension[..., None] * one for link, one in paths.wrenches.items()}
+    alike: dict[Any, list[int]] = {}
+    for k, bundle in enumerate(bundles):
+        key = (bundle.proximal.link, bundle.distal.link, *(w.key for w in bundle.wraps))
+        alike.setdefault(key, []).append(k)
+    tensions: list[Array] = [np.empty(0)] * len(bundles)
+    wrenches: dict[str, list[Array]] = {}
+    for which in alike.values():
+        paths = bundle_paths([bundles[k] for k in which], poses)
+        for k, length in zip(which, paths.length, strict=True):
+            if np.isnan(length).any():
+                names = ", ".join(wrap.name for wrap in bundles[k].wraps)
+                raise ComputationError(f"no taut path over {names}", f"ligament {bundles[k].name}")
+            tensions[k] = bundles[k].force(length)
+        for link, unit in paths.wrenches.items():
+            found = wrenches.setdefault(link, [np.zeros_like(unit[0])] * len(bundles))
+            for k, wrench in zip(which, unit, strict=True):
+                found[k] = tensions[k][..., None] * wrench
+    return np.array(tensions), {link: np.array(found) for link, found in wrenches.items()}
 
 
 def _points(ends: Array, strings: WrappedStrings, rows: Index) -> Array:

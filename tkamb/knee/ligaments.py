@@ -110,7 +110,7 @@ class Ligament:
         if self.wraps:
             from tkamb.knee.ligament_paths import bundle_paths  # imports numba
 
-            return bundle_paths(self, poses).points
+            return bundle_paths((self,), poses).points[0]
         return np.stack(self.ends(poses), axis=-2)
 
     def length(self, poses: Mapping[str, Array]) -> Array:
@@ -118,7 +118,7 @@ class Ligament:
         if self.wraps:
             from tkamb.knee.ligament_paths import bundle_paths  # imports numba
 
-            return bundle_paths(self, poses).length
+            return bundle_paths((self,), poses).length[0]
         proximal, distal = self.ends(poses)
         return np.asarray(np.linalg.norm(distal - proximal, axis=-1))
 
@@ -238,8 +238,7 @@ class BundleArrays:
         from tkamb.knee.ligament_paths import taut_wrenches  # imports numba
 
         placed = {PROXIMAL: poses, DISTAL: np.eye(4)}
-        pulled = [taut_wrenches(bundle, placed)[1][DISTAL] for bundle in self.wrapping]
-        return np.asarray(np.sum(pulled, axis=0))
+        return np.asarray(taut_wrenches(self.wrapping, placed)[1][DISTAL].sum(axis=0))
 
 
 def ligament_loads(
@@ -248,8 +247,8 @@ def ligament_loads(
     """Return the tensions (n,), N, and the loads on the links; their sum is zero.
 
     The forces on the two ends of a straight bundle are equal and opposite, along the line through
-    both ends. There is one load per link for all straight bundles, and one for each bundle that
-    wraps.
+    both ends. There is one load per link for all straight bundles, and one for all bundles that
+    wrap.
 
     Args:
         ligaments: the bundles.
@@ -269,11 +268,10 @@ def ligament_loads(
     if straight:
         tension[~wraps], straight_loads = _straight_loads(straight, poses)
         loads += straight_loads
-    for k in np.flatnonzero(wraps).tolist():
-        pull, on_links = taut_wrenches(ligaments[k], poses)
-        tension[k] = float(pull)
-        for link, wrench in on_links.items():
-            loads.append(PointForces(link, np.zeros((1, 3)), wrench[None, :3], wrench[3:]))
+    tension[wraps], on_links = taut_wrenches([b for b in ligaments if b.wraps], poses)
+    for link, wrenches in on_links.items():
+        wrench = wrenches.sum(axis=0)
+        loads.append(PointForces(link, np.zeros((1, 3)), wrench[None, :3], wrench[3:]))
     return tension, tuple(loads)
 
 

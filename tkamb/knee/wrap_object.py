@@ -6,7 +6,7 @@ along its z axis. With x to the right and y up the string runs clockwise, in fro
 """
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 
@@ -74,6 +74,13 @@ class WrapObject:
                 f"wrap object {self.name}",
                 "only a section has one: see mesh_section",
             )
+
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """All that determines a path over the object; equal for equal objects."""
+        outline = None if self.outline is None else self.outline.tobytes()
+        sizes = (self.dimensions, self.quadrant, self.active, outline)
+        return (self.body, self.shape, self.pose.tobytes(), *sizes)
 
     def on(self, body: str, pose_body_in_other: Array) -> Self:
         """Return the same object given on another body that is fixed to its body."""
