@@ -76,13 +76,38 @@ def moved(values, model, q, v, k, size, by_v=False):
     return values(q, v + move) if by_v else values(pin.integrate(model, q, move), v)
 
 
-def one_sided(values, model, q, v, k, size):
-    """Return the two one-sided derivatives of second order by one direction of q."""
+def one_sided(values, model, q, v, move):
+    """Return the changes along a move (nv,) of q by the one-sided derivatives of second order."""
     here, found = values(q, v), []
     for sign in (1.0, -1.0):
-        near, far = (moved(values, model, q, v, k, n * sign * size) for n in (1, 2))
-        found.append(sign * (-3.0 * here + 4.0 * near - far) / (2.0 * size))
+        near, far = (values(pin.integrate(model, q, n * sign * move), v) for n in (1, 2))
+        found.append(sign * (-3.0 * here + 4.0 * near - far) / 2.0)
     return found
+
+
+def kink_error(values, slope, model, q, v, unit, size, steps):
+    """Return the error of a slope on its own side of a kink; None: there is no kink, or it misses.
+
+    There is a kink if the one-sided differences by every step differ by more than `TOLERANCE`. On
+    its own side the slope agrees with one of them within `TOLERANCE`.
+
+    Args:
+        values: function of q and v.
+        slope: computed derivative along `unit`.
+        model: Pinocchio model.
+        q: configuration.
+        v: velocity.
+        unit: direction (nv,) of q, for a step of 1 m.
+        size: value to which errors are relative.
+        steps: steps, m; steps between and below them are tried, too.
+    """
+    jumps, found = [], []
+    for step in np.geomspace(0.1 * min(steps), max(steps), 5):
+        ahead, behind = (side / step for side in one_sided(values, model, q, v, step * unit))
+        jumps.append(np.abs(ahead - behind).max() / size)
+        found += [np.abs(slope - side).max() / size for side in (ahead, behind)]
+    best = float(min(found))
+    return best if min(jumps) > TOLERANCE and best < TOLERANCE else None
 
 
 def errors(computed, expected):
@@ -125,46 +150,53 @@ def agreement(values, computed, knee, q, v, steps=SHORT):
     size = np.abs(computed[0]).max(axis=tuple(range(computed[0].ndim - 1)))
     size = np.maximum(size, 1e-3 * size.max())
     smooth, on_kinks = [float(by_v.max())], []
+    units = np.diag(step_sizes(knee.model, 1.0))
     for k, error in enumerate(by_q):
+        kink = None
         if error > TOLERANCE:
-            pairs = [
-                one_sided(values, knee.model, q, v, k, step_sizes(knee.model, step)[k])
-                for step in steps
-            ]
-            jump = min(np.abs(ahead - behind).max() for ahead, behind in pairs) / size[k]
-            best = min(
-                np.abs(computed[0][..., k] - side).max() / size[k]
-                for pair in pairs
-                for side in pair
-            )
-            if jump > TOLERANCE and best < TOLERANCE:
-                on_kinks.append(float(best))
-                continue
-        smooth.append(float(error))
+            slope = computed[0][..., k] * units[k, k]
+            relative = size[k] * units[k, k]
+            kink = kink_error(values, slope, knee.model, q, v, units[k], relative, steps)
+        if kink is None:
+            smooth.append(float(error))
+        else:
+            on_kinks.append(kink)
     return Agreement(max(smooth), len(on_kinks), max(on_kinks, default=0.0))
 
 
-def direction_error(values, computed, knee, q, v, steps=SHORT):
-    """Return the relative error of derivatives along one random direction of q, and of v.
+def direction_agreement(values, computed, knee, q, v, steps=SHORT):
+    """Compare derivatives along one random direction of q, and of v, with differences.
 
-    The better of two steps counts, as in `agreement`.
+    The better of two steps counts, and a miss by q may lie on a kink, as in `agreement`.
     """
-    model, found = knee.model, []
-    rng = np.random.default_rng(int(1e6 * abs(q[-1])) % 1000)
+    model, rng = knee.model, np.random.default_rng(int(1e6 * abs(q[-1])) % 1000)
+    unit = rng.choice([-1.0, 1.0], model.nv) * rng.uniform(0.5, 1.0, model.nv)
+    smooth, kinks = [], []
     for by_v in (False, True):
-        one = []
-        for step in steps:
-            sizes = np.full(model.nv, 1e-5) if by_v else step_sizes(model, step)
-            move = sizes * rng.choice([-1.0, 1.0], model.nv) * rng.uniform(0.5, 1.0, model.nv)
+        found, scale = [], np.ones(model.nv) if by_v else step_sizes(model, 1.0)
+        slope = computed[by_v] @ (scale * unit)
+        for step in (1e-5,) if by_v else steps:
+            move = step * scale * unit
             ends = [
                 values(q, v + s * move) if by_v else values(pin.integrate(model, q, s * move), v)
                 for s in (1.0, -1.0)
             ]
-            change = (ends[0] - ends[1]) / 2.0
-            size = np.abs(change).max()
-            one.append(np.abs(computed[by_v] @ move - change).max() / (size or 1.0))
-        found.append(min(one))
-    return float(max(found))
+            change = (ends[0] - ends[1]) / (2.0 * step)
+            size = np.abs(change).max() or 1.0
+            found.append(np.abs(slope - change).max() / size)
+        kink = None
+        if min(found) > TOLERANCE and not by_v:
+            kink = kink_error(values, slope, model, q, v, scale * unit, size, steps)
+        if kink is None:
+            smooth.append(float(min(found)))
+        else:
+            kinks.append(kink)
+    return Agreement(max(smooth), len(kinks), max(kinks, default=0.0))
+
+
+def direction_error(values, computed, knee, q, v, steps=SHORT):
+    """Return the error of `direction_agreement` away from kinks."""
+    return direction_agreement(values, computed, knee, q, v, steps).smooth
 
 
 def forces_of(case):
@@ -172,12 +204,13 @@ def forces_of(case):
     return lambda q, v: vectors(case.knee.external_forces(q, v, case.tensions))
 
 
-def case_errors(case, count):
-    """Return the error of each of `count` states along a random direction."""
+def case_directions(case, count):
+    """Return the agreement of each of `count` states along a random direction."""
     found = []
     for q, v in case.states(count):
         computed = case.knee.external_forces_derivatives(q, v, case.tensions)
-        found.append(direction_error(forces_of(case), computed, case.knee, q, v, case.steps))
+        one = direction_agreement(forces_of(case), computed, case.knee, q, v, case.steps)
+        found.append(one)
     return found
 
 

@@ -115,6 +115,27 @@ def test_the_differential_model_agrees_with_numerical_differences(action):
         assert found.max() < 1e-3, (name, found)
 
 
+def test_a_force_residual_evaluates_the_contact_once(action, control, monkeypatch):
+    import crocoddyl
+
+    dynamics, x, u = action
+    residual = control.CondyleForces(dynamics.state, dynamics.knee, 5)
+    data = residual.createData(crocoddyl.DataCollectorAbstract())
+    kind, evaluated = type(residual._data.probe), []
+    at = kind.at
+    monkeypatch.setattr(kind, "at", lambda self, pose: evaluated.append(pose) or at(self, pose))
+    for move in (0.0, 1e-6):
+        moved = np.array(x)
+        moved[2] += move
+        residual.calc(data, moved, u)
+        residual.calcDiff(data, moved, u)
+    assert len(evaluated) == 2
+    assert data.r.sum() == pytest.approx(800.0, rel=0.1)
+    forces, by_q = dynamics.knee.condyle_forces(moved[:4])
+    assert data.r == pytest.approx(forces, rel=1e-12)
+    assert data.Rx[:, :4] == pytest.approx(by_q, rel=1e-9)
+
+
 def test_a_native_residual_reads_the_pose_of_the_frame(action):
     dynamics, x, u = action
     data, plain = dynamics.createData(), dynamics.knee.model.createData()

@@ -364,11 +364,19 @@ class CondyleForces(_CondyleResidual):
     those of `CondylePressures`.
     """
 
+    _last: tuple[Array, Array] | None = None
+    """The last q, and the derivative there."""
+
     def _values(self, q: Array) -> Array:
-        return self.knee.condyle_forces(q, self._data)[0]
+        forces, by_q = self.knee.condyle_forces(q, self._data)
+        self._last = np.array(q), by_q
+        return forces
 
     def _slopes(self, q: Array) -> Array:
-        return self.knee.condyle_forces(q, self._data)[1]
+        if self._last is None or not np.array_equal(self._last[0], q):
+            self._values(q)
+        assert self._last is not None
+        return self._last[1]
 
 
 class CondylePressures(_CondyleResidual):

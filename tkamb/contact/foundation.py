@@ -7,7 +7,7 @@ import numpy as np
 
 from tkamb.contact.flags import narrow_flags, unsupported_flags
 from tkamb.contact.materials import Material
-from tkamb.contact.model import CondyleWrench, ContactModel, ProbedContact
+from tkamb.contact.model import CondyleWrench, ContactModel, LoadedPoints, ProbedContact
 from tkamb.contact.pressing import PRESS, press_by_search
 from tkamb.contact.result import ContactResult, ContactStatus, Guess, WarmStart, medial_points
 from tkamb.contact.samples import (
@@ -382,6 +382,31 @@ class FoundationProbe:
             for side, condyle in contact.condyles.items()
         }
         return replace(contact, condyles=condyles)
+
+    def loaded_points(self, pose: Array, contact: ProbedContact, slopes: bool) -> LoadedPoints:
+        """Return the pressures of the loaded columns.
+
+        A displacement changes the gap of a column by M . xi/c, and so its pressure p(d/h) by
+        -p' M . xi/(c h).
+
+        Args:
+            pose: (4, 4) pose_femoral_in_insert.
+            contact: contact at that pose.
+            slopes: whether to return the derivative of the pressures.
+        """
+        samples, meeting = self._columns(pose)
+        loaded = (meeting.gap < 0) & ~grazing(samples, meeting)
+        samples, meeting = samples.part(loaded), meeting.part(loaded)
+        strain = -meeting.gap / np.maximum(samples.thickness, LEAST_THICKNESS)
+        pressure = layer_pressure(self._law, self._state.pair.material, strain)
+        medial = medial_points(samples.points, pose, self._state.pair.split)
+        if not slopes:
+            return LoadedPoints(pressure, samples.area, medial, None)
+        met, places = meeting.gradient, samples.points + meeting.gap[:, None] * samples.normals
+        rate = self._rate(samples, meeting.gap) / samples.area
+        growth = -rate / np.einsum("ij,ij->i", met, samples.normals)
+        slope = growth[:, None] * np.hstack([met, np.cross(places, met)])
+        return LoadedPoints(pressure, samples.area, medial, slope)
 
     def _columns(self, pose: Array) -> tuple[SurfaceSamples, Meeting]:
         """Return the near columns, and where they meet the femoral surface."""

@@ -25,7 +25,7 @@ from tkamb.contact.result import (
     wrench_of,
 )
 from tkamb.contact.samples import SampledContact, sample_surface
-from tkamb.geometry.frames import Array, cross
+from tkamb.geometry.frames import Array, Mask, cross
 
 
 class ContactModel(ABC):
@@ -172,6 +172,24 @@ class ProbedContact:
     def wrench(self) -> Array:
         """(6,) force (N) and moment about the insert's origin (N·m), on the insert."""
         return sum((load.wrench for load in self.loads), np.zeros(6))
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedPoints:
+    """The pressures of the m map points in contact at one pose.
+
+    Args:
+        pressure: (m,) Pa.
+        area: (m,) m², area of each point.
+        medial: (m,) whether a point is under the medial condyle.
+        slope: (m, 6) derivative of `pressure` by a displacement, as in `CondyleWrench`; None: not
+            asked for.
+    """
+
+    pressure: Array
+    area: Array
+    medial: Mask
+    slope: Array | None
 
 
 class Probe:

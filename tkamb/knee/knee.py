@@ -238,7 +238,9 @@ class Knee(AssembledKnee):
         from tkamb.knee.smooth_peak import smooth_peaks
 
         contact, data = self._need_contact(), self._data(data)
-        return smooth_peaks(contact, self._kinematics(data, q).pose)
+        kinematics = self._kinematics(data, q)
+        probed = self._contact_at(data, kinematics)
+        return smooth_peaks(contact, data.probe, probed, kinematics.pose)
 
     def condyle_pressure_slopes(self, q: Array, data: KneeData | None = None) -> Array:
         """Return the derivative (2, nv) of `condyle_pressures` by q, Pa/m and Pa/rad.
@@ -255,7 +257,9 @@ class Knee(AssembledKnee):
         contact, data = self._need_contact(), self._data(data)
         twists = self.relative_jacobian(q, data)
         twists = mirrored_spatial(twists.T).T if self.left else twists
-        return smooth_peak_slopes(contact, self._kinematics(data, q).pose) @ twists
+        kinematics = self._kinematics(data, q)
+        probed = self._contact_at(data, kinematics)
+        return smooth_peak_slopes(contact, data.probe, probed, kinematics.pose) @ twists
 
     def stiffness(
         self, q: Array, v: Array, data: KneeData | None = None, exact: bool = True

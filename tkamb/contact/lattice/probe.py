@@ -19,7 +19,8 @@ import numpy as np
 
 from tkamb.contact.lattice.initial_guess import LatticeStart, lattice_start
 from tkamb.contact.lattice.problem import ContactProblem, LatticeState
-from tkamb.contact.model import Probe, ProbedContact, condyle_wrenches
+from tkamb.contact.lattice.report import PressureRule
+from tkamb.contact.model import LoadedPoints, Probe, ProbedContact, condyle_wrenches
 from tkamb.contact.pressing import Presses
 from tkamb.contact.result import ContactResult, Guess, WarmStart, medial_points
 from tkamb.geometry.frames import Array, Index
@@ -38,6 +39,10 @@ LEVER_ARM = 0.03
 
 class ForceModel(Presses, Protocol):
     """A contact model that can compute the forces alone."""
+
+    @property
+    def pressure_rule(self) -> PressureRule:
+        """See `tkamb.contact.lattice.model.CellContact`."""
 
     def evaluate_from(
         self, state: Any, pose: Array, start: Guess | None = None, forces_only: bool = False
@@ -104,6 +109,35 @@ class LatticeProbe(Probe):
         solved = contact.solved
         change = exact_force_changes(self._state, solved.result, solved.start, solved.nodes)
         return self._with_changes(solved, change, exact=True, with_centre=True)
+
+    def loaded_points(self, pose: Array, contact: ProbedContact, slopes: bool) -> LoadedPoints:
+        """Return the pressures of the loaded nodes; their derivative is that of `exact_tangent.py`.
+
+        The area of a node is constant, so that its pressure changes as its force.
+
+        Args:
+            pose: (4, 4) pose_femoral_in_insert.
+            contact: contact of this probe at that pose.
+            slopes: whether to return the derivative of the pressures.
+        """
+        if not contact.condyles:
+            return LoadedPoints(np.empty(0), np.empty(0), np.empty(0, bool), np.empty((0, 6)))
+        assert isinstance(contact, LatticeContact)
+        solved = contact.solved
+        result, nodes = solved.result, solved.nodes
+        pressure, area = result.pressure[nodes], result.area[nodes]
+        medial = medial_points(result.points[nodes], pose, self._state.pair.split)
+        if not slopes:
+            return LoadedPoints(pressure, area, medial, None)
+        from tkamb.contact.lattice.exact_tangent import exact_force_changes
+
+        change = exact_force_changes(self._state, result, solved.start, nodes)
+        force = result.nodal_force[nodes]
+        along = force / np.linalg.norm(force, axis=1)[:, None]
+        if self._lattice_model.pressure_rule == "source":
+            along = -result.normals[nodes]
+        slope = np.einsum("ia,iak->ik", along, change) / area[:, None]
+        return LoadedPoints(pressure, area, medial, slope)
 
     def _with_changes(
         self, solved: "SolvedContact", change: Array, exact: bool, with_centre: bool
