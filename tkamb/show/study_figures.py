@@ -135,7 +135,7 @@ def draw_designs(bars: Mapping[str, Sequence[Bar]]) -> Figure:
         "wear": "Worn volume (mm³ per million cycles)",
     }
     with settings():
-        figure = new_figure(5.4 * len(filled), 3.6)
+        figure = new_figure(10.8, 3.6)
         for axes, (name, some) in zip(
             figure.subplots(1, len(filled), squeeze=False)[0], filled.items(), strict=True
         ):
