@@ -157,7 +157,7 @@ def condyle_yaw(femoral: Surface, search: YawSearch = YAW_SEARCH) -> tuple[float
     for n, yaw in enumerate(yaws):
         cosine, sine = np.cos(yaw), np.sin(yaw)
         turn = np.array([[cosine, 0.0, -sine], [0.0, 1.0, 0.0], [sine, 0.0, cosine]])
-        turned_samples = samples @ turn.T
+        turned_samples = np.einsum("ij,nj->ni", turn, samples)
         extended, _ = _mean_outline(turned_samples, search.strip, np.zeros(1))
         if _rise(extended).max() < CONDYLE.extended_notch_depth:
             continue

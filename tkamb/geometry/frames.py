@@ -70,7 +70,7 @@ def transform(pose_a_in_b: ArrayLike, points: ArrayLike) -> Array:
     rotation, translation = pose_a_in_b[..., :3, :3], pose_a_in_b[..., :3, 3]
     if points.ndim == 1:
         return np.einsum("...ij,j->...i", rotation, points) + translation
-    return points @ np.swapaxes(rotation, -1, -2) + translation[..., None, :]
+    return np.einsum("...ij,...nj->...ni", rotation, points) + translation[..., None, :]
 
 
 def rotate(pose_a_in_b: ArrayLike, vectors: ArrayLike) -> Array:
@@ -79,7 +79,7 @@ def rotate(pose_a_in_b: ArrayLike, vectors: ArrayLike) -> Array:
     vectors = np.asarray(vectors, float)
     if vectors.ndim == 1:
         return np.einsum("...ij,j->...i", rotation, vectors)
-    return vectors @ np.swapaxes(rotation, -1, -2)
+    return np.einsum("...ij,...nj->...ni", rotation, vectors)
 
 
 def cross(a: Array, b: Array) -> Array:
