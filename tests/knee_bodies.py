@@ -12,6 +12,7 @@ import pinocchio as pin
 
 import tkamb
 from tkamb.knee.canonical import mirrored_spatial
+from tkamb.knee.load import link_point
 from tkamb.units import STANDARD_GRAVITY
 
 MIRROR = np.diag([1.0, 1.0, -1.0])
@@ -185,7 +186,11 @@ def other_knee(plain, model, left, plane):
         implant=tkamb.Implant(surfaces[0].mesh if not left else femoral, insert, button),
         ligaments=bundles,
         extensor=extensor,
-        contact=plain.contact.model,
+        contact=None if plain.contact is None else plain.contact.model,
+        muscles=[
+            replace(muscle, points=tuple(moved(link_point(point), left) for point in muscle.points))
+            for muscle in plain.muscles
+        ],
         friction=plain.friction,
         frames=NAMES,
         joints=["knee_free"],

@@ -31,6 +31,8 @@ KNEE_JOINT_NAMES = tuple(f"knee_{name}" for name in KNEE_COORDINATES)
 
 PATELLA_COORDINATES = PATELLA_JOINT_NAMES = ("patella_ap", "patella_si", "patella_rotation")
 """Coordinates of the patella in the femur's sagittal plane (m, m, rad), and names of its joints."""
+PATELLA_BODY_COORDINATES = ("ap", "si", "shift", "flexion", "tilt", "rotation")
+"""Coordinates of a patella with six degrees of freedom (`tkamb.knee.patella_body`), m and rad."""
 
 SIDES = ("medial", "lateral")
 """Names of the condyles."""

@@ -75,6 +75,8 @@ class KneeData:
         start: warm start of the next press, from the last press or evaluation; None: there was
             none.
         button_start: warm start of the next press of the button; None: there was none.
+        patella_coordinates: coordinates (6,) of the last equilibrium of the patella; None: there
+            was none.
         knee: identity of the knee that made the data.
     """
 
@@ -84,6 +86,7 @@ class KneeData:
     seen: "tuple[bytes, ProbedContact] | None" = None
     start: "Guess | None" = None
     button_start: "Guess | None" = None
+    patella_coordinates: Array | None = None
     knee: str = ""
 
     def __repr__(self) -> str:
@@ -129,7 +132,8 @@ class AssembledKnee:
         component = self.anatomy.femoral
         self.chain = CanonicalChain(self.anatomy, is_left, extensor is not None, component, insert)
         self.bridge = Bridge(self.anatomy, is_left, self.chain, component, insert)
-        self.extensor, muscles = extensor, tuple(muscles)
+        self.extensor, self.muscles = extensor, tuple(muscles)
+        muscles = self.muscles
         check_names("muscles", [*self._extensor_names, *(muscle.name for muscle in muscles)])
         self._lines = tension_lines(muscles, self.anatomy)
         self._set_ligaments(ligaments)

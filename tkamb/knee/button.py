@@ -164,11 +164,14 @@ class Button:
             reason = "; ".join((result.status.value.replace("_", " "), *result.flags))
             return ButtonPress(force, button, problem=_of_button(reason), seconds=seconds)
         press = ButtonPress(force, femur @ inverse(result.pose), result, start, seconds=seconds)
-        flags = (*map(_of_button, result.flags), *self._flags(press))
+        flags = (*map(_of_button, result.flags), *self.flags(press))
         return replace(press, flags=flags, seconds=clock.perf_counter() - began)
 
+    def flags(self, press: ButtonPress) -> tuple[str, ...]:
+        """Return flags of unloaded facets, of edges of the femoral component and of imbalance."""
+        return tuple(self._flags(press))
+
     def _flags(self, press: ButtonPress) -> Iterator[str]:
-        """Yield flags of an unloaded facet, of edges of the femoral component and of imbalance."""
         result = press.contact
         assert result is not None
         total = float(np.linalg.norm(result.wrench_on_insert[:3]))

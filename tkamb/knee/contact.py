@@ -165,15 +165,13 @@ class KneeContact:
         by_size = load.force_slope
         by_normal = -(by_force + np.outer(normal, by_size)) / size
         moment = load.wrench[3:] - cross(load.centre, force)
-        by_moment = (
-            by_moment + _cross_matrix(force) @ centre - _cross_matrix(load.centre) @ by_force
-        )
-        turned = _cross_matrix(force) @ by_moment - _cross_matrix(moment) @ by_force
+        by_moment = by_moment + cross_matrix(force) @ centre - cross_matrix(load.centre) @ by_force
+        turned = cross_matrix(force) @ by_moment - cross_matrix(moment) @ by_force
         by_point = (
             centre + turned / size**2 - 2.0 / size**3 * np.outer(cross(force, moment), by_size)
         )
         sliding = twist[:3] + cross(twist[3:], point)
-        by_sliding = _cross_matrix(twist[3:]) @ by_point
+        by_sliding = cross_matrix(twist[3:]) @ by_point
         along = float(sliding @ normal)
         tangential = sliding - along * normal
         # Product rule for t = s - (s . n) n.
@@ -188,7 +186,7 @@ class KneeContact:
             by_tangential / speed - np.outer(tangential, tangential @ by_tangential) / speed**3
         )
         change = np.outer(direction, by_size) + size * by_direction
-        by_moment = _cross_matrix(point) @ change - size * _cross_matrix(direction) @ by_point
+        by_moment = cross_matrix(point) @ change - size * cross_matrix(direction) @ by_point
         return np.vstack([change, by_moment])
 
     def damping(self, contact: ProbedContact, twist: Array) -> Array:
@@ -201,7 +199,7 @@ class KneeContact:
         total = np.zeros((6, 6))
         for load in contact.loads if self.friction else ():
             normal, point = load.normal, load.point
-            point_jacobian = np.hstack([np.eye(3), -_cross_matrix(point)])
+            point_jacobian = np.hstack([np.eye(3), -cross_matrix(point)])
             sliding = point_jacobian @ twist
             tangential = sliding - (sliding @ normal) * normal
             speed = float(np.sqrt(tangential @ tangential + CONTACT_POINT.standstill_speed**2))
@@ -254,9 +252,10 @@ class KneeContact:
         )
 
 
-def _cross_matrix(vector: Array) -> Array:
+def cross_matrix(vector: Array) -> Array:
     """Return the matrix (3, 3) of the cross product with a vector."""
-    return np.cross(vector, -np.eye(3))
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def batch_differences(

@@ -17,6 +17,7 @@ import pinocchio as pin
 from tkamb.errors import ComputationError, InputError, names_near
 from tkamb.geometry.frames import (
     KNEE_COORDINATES,
+    PATELLA_BODY_COORDINATES,
     SIDES,
     Array,
     knee_pose,
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from tkamb.contact.model import ProbedContact
     from tkamb.contact.result import ContactResult, WarmStart
     from tkamb.knee.balance import BalanceStatus
+    from tkamb.knee.patella_equilibrium import PatellaEquilibrium
     from tkamb.knee.pressed import KneeContactResult, KneePatellaResult
     from tkamb.knee.released import KneeEquilibrium
     from tkamb.knee.solution_derivatives import EquilibriumDerivatives, PressDerivatives
@@ -601,6 +603,39 @@ class Knee(AssembledKnee):
             raise ComputationError(press.problem, "press_patella")
         data.button_start = press.start
         return patella_of_user(press, poses, self.button_contact.in_patella, self.left)
+
+    def patella_equilibrium(
+        self,
+        q: Array,
+        tensions: Mapping[str, float] | float,
+        released: Sequence[str] = PATELLA_BODY_COORDINATES,
+        data: KneeData | None = None,
+    ) -> "PatellaEquilibrium":
+        """Return the patella in equilibrium in six degrees of freedom, at the femur's pose of q.
+
+        The heads of the quadriceps are the quadriceps of `extensor` and the muscles of `muscles`
+        that insert on the patella; all wrap the outline that the quadriceps wraps. The strands of
+        the patellar ligament and the retinacula are the ligaments with an end on the patella. The
+        inextensible ligament of `extensor` only gives the initial guess: the plane patella.
+
+        Args:
+            q: configuration, shape (nq,).
+            tensions: head -> tension, N; or the tension of the quadriceps alone, N.
+            released: some of "ap", "si", "shift", "flexion", "tilt", "rotation"
+                (`tkamb.knee.patella_body`). The others keep the values of the plane patella,
+                pressed on the femur: zero out of the plane.
+            data: data from `create_data`; the last equilibrium is the initial guess.
+
+        Raises:
+            InputError: the knee has no patellofemoral contact model or no ligament from patella to
+                tibia, no head pulls, another muscle has a tension, or a name is unknown.
+            ComputationError: the plane patella is lost, or its button cannot be pressed.
+        """
+        from tkamb.knee.patella_equilibrium import find_equilibrium
+
+        data = self._data(data, contact=False)
+        given = self._tensions(tensions)
+        return find_equilibrium(self, q, given, released, data)
 
     def evaluate(self, q: Array, data: KneeData | None = None) -> "KneeContactResult":
         """Return the contact at q: pressure, area and forces from the overlap of the bodies.
