@@ -131,6 +131,9 @@ def test_show_draws_below_the_users_own_node(read, left):
     paths = {command.path.lower() for command in sent}
     for part in ("femoral", "insert", "patella", "pressure", "force/medial/0", "extensor"):
         assert any(f"mine/knee/{part}" in path for path in paths), part
+    # A left knee's map, whose triangles are mirrored, is seen from above, too.
+    (drawn,) = [c for c in sent if "knee/pressure" in c.path.lower()]
+    assert drawn.object.material.lower(drawn.object)["side"] == 2  # THREE.DoubleSide
     # At the first look the insert is upright in the middle of the window; later calls move nothing.
     (view,) = [c.matrix for c in sent if c.path.lower() == "/meshcat"]
     insert = pin.XYZQUATToSE3(q[:7]).homogeneous @ knee.bridge.insert.placement.homogeneous

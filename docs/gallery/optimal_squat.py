@@ -1,14 +1,11 @@
-"""An optimal squat by Crocoddyl, with the peak pressure on the polyethylene.
+"""An optimal squat by Crocoddyl, with peak pressure or contact force in its cost, and without.
 
 A planar leg stands on its fixed foot and carries half of the trunk. Crocoddyl finds the torques at
 ankle and hip and the tension of the quadriceps that bend the knee and stretch it again. The first
 guess stands still; the weight of the wanted 80 degrees grows in steps, and each solution is the
-next first guess. At the last weight the effort balances the bend at about 40 degrees.
-
-Two things did not converge to a stop of 1e-6. With weights of 50 to 400, which bend the knee more
-than 50 degrees, 8 iterations ended at stops of 2e-5 to 4e-4, and a weight of 1000 did not end
-within four minutes. With the pressure in the cost (`tkamb.crocoddyl.CondylePressures`, weight 0.03
-per (10 MPa)²) the steps fell to 0.03, at a stop of 3e-3; with a map of 1 mm to 0.004, at 2e-3.
+next first guess. At the last weight the effort balances the bend at about 40 degrees. From this
+squat two others start: the smooth peak pressures of both condyles, or their contact forces, around
+the deepest instant enter the cost, again with weights that grow in steps.
 """
 
 import time
@@ -21,10 +18,11 @@ import pinocchio as pin
 import trimesh
 
 import tkamb
-from tkamb.crocoddyl import KneeDynamics, KneeStep
+from tkamb.crocoddyl import CondyleForces, CondylePressures, KneeDynamics, KneeStep
 
 FILES = Path(tkamb.__file__).parent / "io" / "starter" / "files"
 NODES, STEP, DEEPEST = 24, 0.05, np.radians(80.0)  # steps of 50 ms; deepest knee flexion
+PRESSED = range(NODES // 2, NODES // 2 + 3)  # nodes with pressure or force in their cost
 femoral, insert = (
     trimesh.load(FILES / f"{name}.stl").apply_scale(1e-3)
     for name in ("femoral_component", "insert")
@@ -52,7 +50,7 @@ points = (("femur", (0.03, 0.20, 0)), ("femur", (0.038, -0.012, 0)), ("tibia", (
 knee = tkamb.Knee(
     model,
     implant=tkamb.Implant(femoral, insert),
-    contact=tkamb.contact_model("foundation", resolution=2e-3),
+    contact=tkamb.contact_model("foundation", resolution=1e-3),
     ligaments=[
         tkamb.Ligament(
             name,
@@ -111,10 +109,10 @@ q, rest = standing(q, np.array([0.0, 0.0, 300.0]))
 start = np.concatenate([q, np.zeros(5)])
 
 
-def squat(flexion_weight, xs, us):
+def squat(flexion_weight, xs, us, pressure_weight=0.0, force_weight=0.0):
     """Return the solver after it has found a squat, from a first guess of states and controls."""
 
-    def node(step, bend_weight=0.0, end_weight=0.0):
+    def node(step, bend_weight=0.0, end_weight=0.0, pressed=False):
         costs = crocoddyl.CostModelSum(state, 3)
 
         def add(name, residual, weights, weight):
@@ -128,49 +126,81 @@ def squat(flexion_weight, xs, us):
         add("posture", posture, [0.3, 0, 0, 0.3, 0.3, 0.1, 0.1, 0.1, 0.1, 0.1], 1.0)
         add("end", posture, [1, 0, 0, 1, 1, 1, 1, 1, 1, 1], end_weight)
         add("bend", bent, [0, 0, 0, 1, 0, 0, 0, 0, 0, 0], bend_weight)
+        for residual, unit, weight in (
+            (CondylePressures, 1e7, pressure_weight),  # 10 MPa
+            (CondyleForces, 1e3, force_weight),  # 1 kN
+        ):
+            if pressed and weight:
+                add(residual.__name__, residual(state, knee, 3), [unit**-2] * 2, weight)
         dynamics = KneeDynamics(state, Torques(state, 2), knee, costs, muscles=["quadriceps"])
         return KneeStep(dynamics, step)
 
-    running = [node(STEP, flexion_weight if k == NODES // 2 else 0.0) for k in range(NODES)]
+    running = [
+        node(STEP, flexion_weight if k == NODES // 2 else 0.0, pressed=k in PRESSED)
+        for k in range(NODES)
+    ]
     problem = crocoddyl.ShootingProblem(start, running, node(0.0, end_weight=1e2))
     problem.nthreads = 1  # models in Python
     solver = crocoddyl.SolverFDDP(problem)
     solver.th_stop = 1e-6
     converged = solver.solve(xs, us, 60, True)
-    print(f"weight {flexion_weight}: {solver.iter} iterations, stop {solver.stop:.1e}")
+    weights = flexion_weight, pressure_weight, force_weight
+    print(f"weights {weights}: {solver.iter} iterations, stop {solver.stop:.1e}")
     assert converged
+    assert solver.iter > 0
+    assert solver.stop <= 1e-6
     return solver
 
 
-began, xs, us = time.perf_counter(), [start] * (NODES + 1), [rest] * NODES
-for weight in (3, 8, 20):
-    solver = squat(weight, xs, us)
-    xs, us = list(solver.xs), list(solver.us)
+def sequence(xs, us, calls):
+    """Return states and controls of the last of several squats, each the next first guess."""
+    for weights in calls:
+        solver = squat(xs=xs, us=us, **weights)
+        xs, us = list(solver.xs), list(solver.us)
+    return xs, us
+
+
+began = time.perf_counter()
+bends = [{"flexion_weight": weight} for weight in (3, 8, 20)]
+plain = sequence([start] * (NODES + 1), [rest] * NODES, bends)
+found = {
+    "without": plain,
+    "with peak pressure": sequence(
+        *plain, [bends[-1] | {"pressure_weight": weight} for weight in (0.1, 0.3)]
+    ),
+    "with contact force": sequence(
+        *plain, [bends[-1] | {"force_weight": weight} for weight in (0.3, 1, 3)]
+    ),
+}
 seconds = time.perf_counter() - began
 
-figure, axes = plt.subplots(1, 4, figsize=(11.0, 3.2), layout="constrained")
-instants, states = STEP * np.arange(NODES + 1), np.array(xs)
-contacts = [knee.evaluate(x[:5]) for x in states]
-sides = [[one for one in (c.medial, c.lateral) if one is not None] for c in contacts]
-pressures = [1e-6 * max(one.peak_pressure for one in pair) for pair in sides]
-axes[0].plot(instants, np.degrees(states[:, 3]))
-axes[1].plot(instants, [sum(one.force for one in pair) for pair in sides])
-axes[2].plot(instants, pressures)
-for k, colour in ((0, "#999999"), (NODES // 2, "#0072B2")):
+figure, axes = plt.subplots(1, 4, figsize=(12.0, 3.2), layout="constrained")
+instants, peaks = STEP * np.arange(NODES + 1), []
+for (words, (xs, _)), colour in zip(found.items(), ("#666666", "#0072B2", "#D55E00"), strict=True):
+    states = np.array(xs)
+    contacts = [knee.evaluate(x[:5]) for x in states]
+    sides = [[one for one in (c.medial, c.lateral) if one is not None] for c in contacts]
+    flexion = np.degrees(states[:, 3])
+    force = [sum(one.force for one in pair) for pair in sides]
+    pressure = [1e-6 * max(one.peak_pressure for one in pair) for pair in sides]
+    for ax, values in zip(axes, (flexion, force, pressure), strict=False):
+        ax.plot(instants, values, color=colour, label=words)
     place = model.createData()
-    pin.forwardKinematics(model, place, states[k, :5])
+    pin.forwardKinematics(model, place, states[np.argmax(flexion), :5])
     head = place.oMi[5].act(np.array([0.0, 0.5, 0.0]))
     chain = np.array([place.oMi[j].translation for j in (1, 4, 5)] + [head])
-    axes[3].plot(chain[:, 0], chain[:, 1], "o-", color=colour, label=f"{instants[k]:.1f} s")
+    axes[3].plot(chain[:, 0], chain[:, 1], "o-", color=colour)
+    peaks.append((max(flexion), max(force), max(pressure)))
+    print(f"{words}: to %.1f degrees, %.0f N, %.2f MPa" % peaks[-1])
 labels = "knee flexion (deg)", "contact force (N)", "peak pressure (MPa)", "height (m)"
 for ax, label in zip(axes, labels, strict=True):
     ax.set(xlabel="time (s)", ylabel=label)
-axes[3].set(xlabel="forward (m)", aspect="equal", xlim=(-0.3, 0.6))
-axes[3].legend(fontsize=7, loc="center right")
+axes[3].set(xlabel="forward (m)", aspect="equal", xlim=(-0.4, 0.6))
+axes[0].legend(fontsize=7, loc="lower center")
 figure.savefig("optimal_squat.png", dpi=100)
 
-deepest = np.degrees(states[:, 3].max())
-print(f"{seconds:.0f} s; to {deepest:.1f} degrees, peak pressure {max(pressures):.1f} MPa")
-assert solver.iter > 0
-assert solver.stop <= 1e-6
-assert 35.0 < deepest < 45.0
+print(f"{seconds:.0f} s")
+without, with_pressure, with_force = peaks
+assert 35.0 < without[0] < 45.0, without
+assert with_pressure[2] < without[2] - 0.3, peaks
+assert with_force[1] < 0.8 * without[1], peaks

@@ -209,5 +209,5 @@ def _map(
     colours = np.stack([np.interp(share, ramp, channel) for channel in PRESSURE_COLOURS.T], axis=1)
     # Above the insert's surface, which would hide a part of the map.
     points = in_world(contact.points + 1e-4 * contact.normals)
-    material = geometry.MeshBasicMaterial(vertexColors=True, side="DoubleSide")
+    material = geometry.MeshBasicMaterial(vertexColors=True)  # both sides are drawn
     node.set_object(geometry.TriangularMeshGeometry(points, loaded, colours), material)
