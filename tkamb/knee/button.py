@@ -164,12 +164,15 @@ class Button:
             reason = "; ".join((result.status.value.replace("_", " "), *result.flags))
             return ButtonPress(force, button, problem=_of_button(reason), seconds=seconds)
         press = ButtonPress(force, femur @ inverse(result.pose), result, start, seconds=seconds)
-        flags = (*map(_of_button, result.flags), *self.flags(press))
-        return replace(press, flags=flags, seconds=clock.perf_counter() - began)
+        return replace(press, flags=self.flags(press), seconds=clock.perf_counter() - began)
 
     def flags(self, press: ButtonPress) -> tuple[str, ...]:
-        """Return flags of unloaded facets, of edges of the femoral component and of imbalance."""
-        return tuple(self._flags(press))
+        """Return the flags of a press with a contact: those of its model, and those of a button.
+
+        The latter are an unloaded facet, an edge of the femoral component, and imbalance.
+        """
+        assert press.contact is not None
+        return (*map(_of_button, press.contact.flags), *self._flags(press))
 
     def _flags(self, press: ButtonPress) -> Iterator[str]:
         result = press.contact

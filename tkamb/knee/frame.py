@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from tkamb.knee.button import ButtonPress
     from tkamb.knee.contact import KneeContact
     from tkamb.knee.knee import Knee
+    from tkamb.knee.patella_equilibrium import FoundPatella
+    from tkamb.knee.patella_frame import PatellaMethod
     from tkamb.knee.released import KneeEquilibrium, ReleasedKnee
     from tkamb.knee.starts import InitialPoses
 
@@ -72,11 +74,13 @@ class FrameStart:
         equilibrium: equilibrium of the released coordinates; None: none are released, or the frame
             failed.
         button: warm start of the button's contact; None: there is none.
+        patella: coordinates (6,) of the patella as a body; None: there are none.
     """
 
     contact: "WarmStart | None" = None
     equilibrium: "KneeEquilibrium | None" = None
     button: "WarmStart | None" = None
+    patella: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +113,7 @@ class Frame:
         post: contact of cam and post; None: not modelled.
         button: the button pressed on the femoral component; None: not modelled, or the frame
             failed.
+        patella: the patella in six degrees of freedom; None: not modelled, or the frame failed.
     """
 
     geometry: KneeGeometry
@@ -131,12 +136,15 @@ class Frame:
     triangles: Index | None = None
     post: "PostContact | None" = None
     button: "ButtonPress | None" = None
+    patella: "FoundPatella | None" = None
 
     @property
     def next(self) -> FrameStart:
         """The initial guess of the next frame."""
         button = None if self.button is None else self.button.start
-        return FrameStart(self.start, None if self.problem else self.equilibrium, button)
+        found = self.patella is not None and not self.patella.problem
+        patella = self.patella.balance.coordinates if self.patella and found else None
+        return FrameStart(self.start, None if self.problem else self.equilibrium, button, patella)
 
     @property
     def pressed(self) -> bool:
@@ -179,6 +187,7 @@ class FrameMethod:
         post: surface of the insert's post, insert frame; None: not modelled.
         ready_cam: `cam` of another method with the same contact model, perhaps with another
             material; None: prepared here.
+        patella: how the patella moves in six degrees of freedom; None: in its plane.
     """
 
     knee: "Knee"
@@ -188,6 +197,7 @@ class FrameMethod:
     split_sensitivity: bool = True
     post: "Surface | None" = None
     ready_cam: "CamPost | None" = None
+    patella: "PatellaMethod | None" = None
 
     def of(self, knee: "Knee") -> "FrameMethod":
         """Return the same method for another knee."""
@@ -258,15 +268,27 @@ class FrameMethod:
         frame, button = self._knee_frame(instant, before), self.knee.button_contact
         if button is None or frame.failures or frame.geometry.extensor is None:
             return frame
-        state = frame.geometry.state
+        from tkamb.knee.button import ButtonPress
+
+        state, extensor = frame.geometry.state, frame.geometry.extensor
         size = frame.loads.values.get("patellofemoral", NAN)
-        press = button.pressed(
-            state.pose("femur"),
-            state.pose("patella"),
-            size * frame.geometry.extensor.contact_normal,
-            before[-1].button if before else None,
-        )
-        return replace(frame, button=press)
+        last = before[-1] if before else FrameStart()
+        force = size * extensor.contact_normal
+        began = clock.perf_counter()
+        if self.patella is None:
+            femur, patella = state.pose("femur"), state.pose("patella")
+            return replace(frame, button=button.pressed(femur, patella, force, last.button))
+        tension, found = extensor.tension(frame.loads.values), None
+        try:
+            found = self.patella.at(frame.geometry, tension, force, last.patella)
+            problem = found.problem
+        except ComputationError as error:
+            problem = f"patella: {error.what}"
+        press = found.press if found else None
+        if press is None:
+            press = ButtonPress(force, np.full((4, 4), NAN), problem=problem)
+        press = replace(press, seconds=clock.perf_counter() - began)
+        return replace(frame, button=press, patella=found)
 
     def _knee_frame(self, instant: Instant, before: Sequence[FrameStart]) -> Frame:
         """Return loads and femorotibial contact at an instant."""

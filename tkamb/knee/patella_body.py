@@ -160,6 +160,9 @@ class PatellaBody:
         heads: heads of the quadriceps.
         lines: strands of the patellar ligament and retinacula, from femur or tibia to the patella.
         poses: link -> pose (4, 4) in the insert frame, without the patella.
+
+    Attributes:
+        bundles: the lines, in the femoral frame and the button frame.
     """
 
     def __init__(
@@ -171,7 +174,8 @@ class PatellaBody:
         lines: Sequence[Ligament],
         poses: Mapping[str, Array],
     ) -> None:
-        self._button, self._probe, self._joint = button, probe, joint
+        self.button, self.joint, self._probe = button, joint, probe
+        self.heads, self.lines, self.poses = tuple(heads), tuple(lines), dict(poses)
         back = inverse(button.in_patella)
         self._heads = [(head, transform(back, head.insertion)) for head in heads]
         femur = inverse(poses["femur"])
@@ -181,7 +185,11 @@ class PatellaBody:
 
     def femur_in_button(self, coordinates: Array) -> Array:
         """Return pose_femur_in_button (4, 4) at coordinates (6,)."""
-        return inverse(self._joint @ patella_pose(coordinates) @ self._button.in_patella)
+        return inverse(self.joint @ patella_pose(coordinates) @ self.button.in_patella)
+
+    def patella(self, coordinates: Array) -> Array:
+        """Return pose_patella_in_insert (4, 4) at coordinates (6,)."""
+        return np.asarray(self.poses["femur"] @ self.joint @ patella_pose(coordinates))
 
     def wrench(self, coordinates: Array) -> Array:
         """Return w (6,), N and N·m; NaN where the contact model or a line has no result."""
@@ -251,7 +259,7 @@ class PatellaBody:
         The columns are translations (m) of the point at the origin, then rotations (rad).
         """
         axes = _rotation_axes(coordinates)
-        button = patella_pose(coordinates) @ self._button.in_patella
+        button = patella_pose(coordinates) @ self.button.in_patella
         arm = button[:3, 3] - coordinates[:3]
         total = np.zeros((6, 6))
         total[:3, :3] = np.eye(3)
@@ -265,7 +273,7 @@ class PatellaBody:
         A rotation about a_k turns the button, its arm and the later axes.
         """
         axes = _rotation_axes(coordinates)
-        button = patella_pose(coordinates) @ self._button.in_patella
+        button = patella_pose(coordinates) @ self.button.in_patella
         arm = button[:3, 3] - coordinates[:3]
         force, moment = button[:3, :3] @ wrench[:3], button[:3, :3] @ wrench[3:]
         result = np.zeros((6, 6))

@@ -1,16 +1,18 @@
 """The equilibrium of a knee's patella in six degrees of freedom (`Knee.patella_equilibrium`)."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+import time as clock
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pinocchio as pin
 
 from tkamb.contact.result import ContactStatus
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import PATELLA_BODY_COORDINATES, Array, inverse, mirrored_pose
 from tkamb.knee.button import ButtonPress
-from tkamb.knee.canonical import KneePose, se3
+from tkamb.knee.canonical import se3
 from tkamb.knee.ligaments import ligament_loads
 from tkamb.knee.load import LinkPoint, PointForces, link_point, wrenches
 from tkamb.knee.muscles import off_femur
@@ -76,6 +78,72 @@ class PatellaEquilibrium:
         return bool(self.reason)
 
 
+@dataclass(frozen=True, eq=False)
+class FoundPatella:
+    """The patella of a right knee in equilibrium, in the insert frame.
+
+    Args:
+        balance: coordinates, residual and stiffness.
+        press: contact of the button; None: no equilibrium.
+        tensions: ligament at the patella -> tension, N.
+        loads: loads of these ligaments on the links.
+        flags: warnings in words, without those of the contact.
+        problem: why there is no equilibrium, in words; empty: there is one.
+    """
+
+    balance: PatellaBalance
+    press: ButtonPress | None = None
+    tensions: dict[str, float] = field(default_factory=dict)
+    loads: tuple[PointForces, ...] = ()
+    flags: tuple[str, ...] = ()
+    problem: str = ""
+
+
+def found_patella(
+    body: PatellaBody, guesses: Iterable[Callable[[], Array]], numbers: Sequence[int]
+) -> FoundPatella:
+    """Return the patella in equilibrium from the first guess that leads to one.
+
+    Args:
+        body: forces on the patella, with at least one head that pulls.
+        guesses: functions that return initial guesses (6,).
+        numbers: numbers of the released coordinates.
+    """
+    tensions = {head.name: head.tension for head in body.heads}
+    size, balance = sum(tensions.values()), None
+    for guess in guesses:
+        balance = body.balance(guess(), numbers, size)
+        if not balance.problem:
+            break
+    assert balance is not None
+    insertions = {head.name: head.insertion for head in body.heads}
+    flags = [
+        f"patella: no head of the quadriceps pulls on the {side} side"
+        for side in sides_without_head(insertions, tensions)
+    ]
+    if balance.problem:
+        return FoundPatella(balance, flags=tuple(flags), problem=balance.problem)
+    if balance.residual > LARGEST_RESIDUAL * size:
+        flags.append(
+            f"patella: a residual of {balance.residual:.2g} N remains, because the force of the "
+            "contact jumps there from facet to facet"
+        )
+    began, button = clock.perf_counter(), body.button
+    contact = button.contact.model.evaluate(
+        button.contact.state, body.femur_in_button(balance.coordinates)
+    )
+    if contact.status is not ContactStatus.OK:
+        problem = f"patella: {contact.reason}"
+        return FoundPatella(balance, flags=tuple(flags), problem=problem)
+    poses = body.poses | {"patella": body.patella(balance.coordinates)}
+    press = ButtonPress(np.full(3, np.nan), poses["patella"] @ button.in_patella, contact)
+    press = replace(press, flags=button.flags(press), seconds=clock.perf_counter() - began)
+    pulls, loads = ligament_loads(body.lines, poses)
+    names = [line.name for line in body.lines]
+    pulled = dict(zip(names, pulls.tolist(), strict=True))
+    return FoundPatella(balance, press, pulled, loads, tuple(flags))
+
+
 def find_equilibrium(
     knee: "Knee",
     q: Array,
@@ -92,69 +160,69 @@ def find_equilibrium(
     button, numbers = knee.button_contact, released_numbers(released)
     if button is None:
         raise InputError("has no patellofemoral contact model", "Knee", "give it")
-    heads, size = _heads(knee, tensions), sum(tensions.values())
+    heads = _heads(knee, tensions)
     _check_strands(knee)
     kinematics = knee._kinematics(data, q)
     poses = knee._link_poses(kinematics, None)
-    joint = knee.chain.patella_joint_in_femur
     # Each search has its own probe: the warm start of the contact is not part of the result.
-    body = PatellaBody(button, button.contact.probe(), joint, heads, knee._others, poses)
-    found = None
-    if data.patella_coordinates is not None and len(numbers) == len(PATELLA_BODY_COORDINATES):
-        found = body.balance(data.patella_coordinates, numbers, size)
-    if found is None or found.problem:
-        found = body.balance(_first_guess(knee, kinematics, data, size), numbers, size)
-    flags = [
-        f"patella: no head of the quadriceps pulls on the {side} side"
-        for side in sides_without_head({head.name: head.insertion for head in heads}, tensions)
-    ]
-    if found.residual > LARGEST_RESIDUAL * size and not found.problem:
-        flags.append(
-            f"patella: a residual of {found.residual:.2g} N remains, because the force of the "
-            "contact jumps there from facet to facet"
-        )
-    if found.problem:
-        return _result(knee, found, None, {}, [], flags)
-    data.patella_coordinates = found.coordinates
-    patella = poses["femur"] @ joint @ patella_pose(found.coordinates)
-    poses["patella"] = patella
-    place = body.femur_in_button(found.coordinates)
-    contact = button.contact.model.evaluate(button.contact.state, place)
-    press = ButtonPress(np.full(3, np.nan), patella @ button.in_patella, contact)
-    press = replace(press, flags=button.flags(press))
-    pulls, loads = ligament_loads(knee._others, poses)
-    names = [line.name for line in knee._others]
-    links = _link_wrenches(press, heads, poses, loads)
-    forces = knee.bridge.joint_forces(data.data, links)
-    result = patella_of_user(press, poses, button.in_patella, knee.left)
-    if contact.status is not ContactStatus.OK:
-        found = replace(found, problem=f"patella: {contact.reason}")
-        return _result(knee, found, None, {}, [], flags)
-    tension = dict(zip(names, pulls.tolist(), strict=True))
-    return _result(knee, found, result, tension, forces, [*flags, *press.flags])
+    probe, joint = button.contact.probe(), knee.chain.patella_joint_in_femur
+    body = PatellaBody(button, probe, joint, heads, knee._others, poses)
+    guesses: list[Callable[[], Array]] = []
+    last = data.patella_coordinates
+    if last is not None and len(numbers) == len(PATELLA_BODY_COORDINATES):
+        guesses.append(lambda: last)
 
+    def pressed_plane() -> Array:
+        plane = knee._find_patella(kinematics, data)
+        ratio = max(plane.patellofemoral_ratio, LIGHT_PRESS)
+        force = sum(tensions.values()) * ratio * plane.contact_normal
+        return pressed_coordinates(body, plane.coordinates, force)
 
-def _result(
-    knee: "Knee",
-    found: PatellaBalance,
-    contact: KneePatellaResult | None,
-    tensions: dict[str, float],
-    forces: Any,
-    flags: Sequence[str],
-) -> PatellaEquilibrium:
-    place = knee.chain.patella_joint_in_femur @ patella_pose(found.coordinates)
+    found = found_patella(body, [*guesses, pressed_plane], numbers)
+    balance = found.balance
+    place = joint @ patella_pose(balance.coordinates)
+    contact, forces = None, pin.StdVec_Force()
+    if found.press is not None:
+        data.patella_coordinates = balance.coordinates
+        poses |= {"patella": body.patella(balance.coordinates)}
+        contact = patella_of_user(found.press, poses, button.in_patella, knee.left)
+        links = _link_wrenches(found, heads, poses)
+        forces = knee.bridge.joint_forces(data.data, links)
     return PatellaEquilibrium(
-        dict(zip(PATELLA_BODY_COORDINATES, found.coordinates.tolist(), strict=True)),
+        dict(zip(PATELLA_BODY_COORDINATES, balance.coordinates.tolist(), strict=True)),
         se3(mirrored_pose(place) if knee.left else place),
         contact,
-        tensions,
+        found.tensions,
         forces,
-        found.residual,
-        found.stiffness,
-        tuple(flags),
+        balance.residual,
+        balance.stiffness,
+        (*found.flags, *(found.press.flags if found.press else ())),
         found.problem,
-        found.trials,
+        balance.trials,
     )
+
+
+def pressed_coordinates(body: PatellaBody, plane: Array, force: Array) -> Array:
+    """Return the coordinates (6,) of the plane patella, pressed on the femur: an initial guess.
+
+    Args:
+        body: forces on the patella.
+        plane: coordinates of the plane patella, shape (3,), m and rad.
+        force: patellofemoral force on the patella, insert frame, shape (3,), N.
+
+    Raises:
+        ComputationError: the button cannot be pressed there.
+    """
+    coordinates = np.zeros(6)
+    coordinates[list(PLANE)] = plane
+    press = body.button.pressed(body.poses["femur"], body.patella(coordinates), force)
+    if press.problem:
+        raise ComputationError(press.problem, WHERE)
+    pressed = coordinates_of(
+        inverse(body.poses["femur"] @ body.joint) @ press.pose @ inverse(body.button.in_patella)
+    )
+    coordinates[list(PLANE)] = pressed[list(PLANE)]
+    return coordinates
 
 
 def _heads(knee: "Knee", tensions: Mapping[str, float]) -> list[Head]:
@@ -203,36 +271,12 @@ def _check_strands(knee: "Knee") -> None:
         )
 
 
-def _first_guess(knee: "Knee", kinematics: KneePose, data: "KneeData", size: float) -> Array:
-    """Return the coordinates (6,) of the plane patella, pressed on the femur.
-
-    Raises:
-        ComputationError: the plane patella is lost.
-    """
-    button = knee.button_contact
-    assert button is not None
-    plane = knee._find_patella(kinematics, data)
-    coordinates = np.zeros(6)
-    coordinates[list(PLANE)] = plane.coordinates
-    joint = kinematics.pose @ knee.chain.patella_joint_in_femur
-    ratio = plane.patellofemoral_ratio
-    force = size * (ratio if ratio > LIGHT_PRESS else LIGHT_PRESS) * plane.contact_normal
-    press = button.pressed(kinematics.pose, joint @ patella_pose(coordinates), force)
-    if press.problem:
-        raise ComputationError(press.problem, WHERE)
-    pressed = coordinates_of(inverse(joint) @ press.pose @ inverse(button.in_patella))
-    coordinates[list(PLANE)] = pressed[list(PLANE)]
-    return coordinates
-
-
 def _link_wrenches(
-    press: ButtonPress,
-    heads: Sequence[Head],
-    poses: Mapping[str, Array],
-    loads: Sequence[PointForces],
+    found: FoundPatella, heads: Sequence[Head], poses: Mapping[str, Array]
 ) -> dict[str, Array]:
     """Return link -> wrench (6,) about the insert's origin of all loads at the patella."""
-    on_patella = press.on_patella.copy()
+    assert found.press is not None
+    on_patella, loads = found.press.on_patella.copy(), found.loads
     back, femur = inverse(poses["femur"]), poses["femur"]
     for head in heads:
         on_femur = back @ poses["patella"]

@@ -44,6 +44,7 @@ _RECORDED = "[contact] with adduction not released"
 _MARKERS = "[motion.markers]"
 _ADJUST = "[contact] with adjust = true"
 _MEASURED = "[measured]"
+_RELEASED_PATELLA = "[patella] released; without it there is no such column"
 BUTTON_NEEDS = "[contact.patellofemoral]; without it there is no such column"
 _POST = "[contact] post; without it there is no such column"
 
@@ -55,7 +56,10 @@ RESERVE = "reserve_<coordinate>_Nm"
 JOINT_MOMENT = "joint_moment_<coordinate>_Nm"
 ENVELOPE = "envelope_<name>"
 CONTRIBUTIONS = {side: f"{side}_from_<name>_N" for side in ("medial", "lateral")}
+PATELLA_LINE = "patella_line_<name>_N"
+"""Family of columns: one per [[patella.ligament]]."""
 FAMILIES = (
+    PATELLA_LINE,
     *(LIGAMENT, MUSCLE_FORCE, ACTIVATION, RESERVE, JOINT_MOMENT, ENVELOPE),
     *CONTRIBUTIONS.values(),
 )
@@ -356,6 +360,19 @@ COLUMNS: tuple[Column, ...] = (
             ("contact_seconds", "computing time of the button's contact"),
         )
     ),
+    *(
+        Column(f"patella_{name}", meaning, _RELEASED_PATELLA, optional=True)
+        for name, meaning in (
+            ("ap_mm", "position of the patella's origin in its joint's frame, anterior"),
+            ("si_mm", "the same, superior"),
+            ("shift_mm", "the same, lateral"),
+            ("flexion_deg", "flexion of the patella on the femur, about the femur's ML axis"),
+            ("tilt_deg", "tilt, positive: the lateral edge is nearer to the femur"),
+            ("rotation_deg", "rotation in its own plane, positive: the superior pole is lateral"),
+            ("residual_N", "largest residual force on a released coordinate"),
+        )
+    ),
+    Column(PATELLA_LINE, "tension of the ligament <name> of the patella", "[[patella.ligament]]"),
     *(
         Column(f"post_{name}", meaning, _POST, optional=True)
         for name, meaning in (

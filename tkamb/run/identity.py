@@ -93,6 +93,8 @@ def scene_content(scene: "Scene") -> Any:
     unused |= {} if scene.material else {"material": True}
     if scene.contact and scene.contact.patellofemoral is None:  # the hash of earlier releases
         unused["contact"] = {"patellofemoral"}
+    if scene.patella and not scene.patella.released:
+        unused["patella"] = {"released", "head", "ligament"}
     return _with_content(scene.model_dump(exclude=unused))
 
 

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from tkamb.contact.pair import ContactPair
     from tkamb.knee.contact import KneeContact
     from tkamb.knee.extensor import ExtensorFrames
+    from tkamb.knee.ligaments import Ligament
+    from tkamb.knee.patella_frame import PatellaMethod
     from tkamb.run.muscles.shared_muscles import SharedMuscles
 
 STRAIN_FLEXIONS = (0.0, 60.0, 90.0)
@@ -109,16 +111,21 @@ def recording_of(
     if knee.extensor_lines is not None:
         extensor = _extensor_frames(case, knee, poses, shared)
     strains = None
-    if case.ligaments:
+    patella_lines: tuple[Ligament, ...] = ()
+    if case.ligaments or case.patella_ligaments:
         from tkamb.knee.ligaments import build_ligaments, strain_table
 
         flexion, links = case.motion.coordinates[:, 5], link_poses(case, poses, extensor)
+        patella_lines = build_ligaments(case.patella_ligaments, links, flexion)
+    if case.ligaments:
         bundles = build_ligaments(case.ligaments, links, flexion)
         knee = knee.with_ligaments(bundles)
         strains = strain_table(bundles, links, flexion, STRAIN_FLEXIONS)
     motion = _motion(case, extensor)
     muscles = shared.muscles if shared else _muscles(case)
     ground, method = _ground(case, motion), _method(case, knee, split_sensitivity, cam)
+    if patella_lines:
+        method = replace(method, patella=_patella_method(case, knee, patella_lines))
     return Recording(method, motion, ground, extensor, muscles, strains)
 
 
@@ -135,6 +142,25 @@ def _method(case: Case, knee: Knee, split_sensitivity: bool, cam: "CamPost | Non
     return FrameMethod(knee, coupled, released, adjust, split_sensitivity, case.post, cam)
 
 
+def _patella_method(case: Case, knee: Knee, lines: "tuple[Ligament, ...]") -> "PatellaMethod":
+    """Return how the released patella of a case is found, with its ligaments' slack lengths."""
+    from tkamb.knee.muscles import off_femur
+    from tkamb.knee.patella_frame import HeadShare, PatellaMethod
+
+    assert case.scene.patella is not None and knee.extensor_lines is not None
+    assert knee.button_contact is not None
+    main, heads = knee.extensor_lines.muscle, case.patella_heads
+    if not heads:
+        segment = off_femur(main.points, knee.chain)
+        origin, insertion = main.points[segment : segment + 2]
+        heads = (HeadShare(main.name, origin, insertion, 1.0),)
+    outline, released = (
+        None if main.wrap is None else main.wrap.outline,
+        case.scene.patella.released,
+    )
+    return PatellaMethod(knee.button_contact, knee.chain, heads, lines, outline, released)
+
+
 def link_poses(case: Case, poses: Array, extensor: "ExtensorFrames | None") -> dict[str, Array]:
     """Return link -> recorded pose_link_in_insert, (f, 4, 4), for all links with attachments.
 
@@ -149,7 +175,8 @@ def link_poses(case: Case, poses: Array, extensor: "ExtensorFrames | None") -> d
     if extensor is not None:
         places = [sagittal_pose(extensor.joints(k)[0]) for k in range(len(poses))]
         result["patella"] = poses @ chain.patella_joint_in_femur @ np.array(places)
-    links = {link for bundle in case.ligaments for link in bundle.links}
+    bundles = (*case.ligaments, *case.patella_ligaments)
+    links = {link for bundle in bundles for link in bundle.links}
     if ligament is not None:
         links |= {ligament.proximal.link, ligament.distal.link}
     for link in links - set(result):

@@ -209,7 +209,7 @@ class Recording:
             state = self.knee.button_contact.contact.state
             pose, pressure, gap = (arrays[BUTTON + name] for name in ("pose", "pressure", "gap"))
             button = WarmStart(state.pair, pose, state.points, pressure, gap)
-        return FrameStart(start, equilibrium, button)
+        return FrameStart(start, equilibrium, button, arrays.get("patella_coordinates"))
 
 
 RESULT_ARRAYS = ("pose", "pressure", "gap", "nodal_force")
@@ -237,6 +237,8 @@ def frame_arrays(frame: Frame) -> dict[str, Array] | None:
     if frame.button is not None and frame.button.contact is not None:
         for name in RESULT_ARRAYS:
             arrays[BUTTON + name] = np.asarray(getattr(frame.button.contact, name), float)
+    if frame.next.patella is not None:
+        arrays["patella_coordinates"] = frame.next.patella
     if knee is not None:
         arrays["equilibrium_coordinates"] = knee.coordinates
         arrays["equilibrium_force"] = knee.balance.force

@@ -175,6 +175,7 @@ def frame_status(
     words += contradictions(case, frame)
     words += [*frame.flags, *(frame.post.flags if frame.post else ())]
     words += frame.button.words if frame.button else ()
+    words += frame.patella.flags if frame.patella else ()
     words += question_flags
     if frame.failures:
         return FAILED + "; ".join([*frame.failures, *words])

@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tkamb.geometry.frames import KNEE_COORDINATES, SIDES, Array, knee_coordinates
+from tkamb.geometry.frames import (
+    KNEE_COORDINATES,
+    PATELLA_BODY_COORDINATES,
+    SIDES,
+    Array,
+    knee_coordinates,
+)
 from tkamb.io.recordings.gait_cycle import cycle_percent
 from tkamb.io.scene.case import Case
 from tkamb.knee.crossing import condyle_contributions
@@ -20,6 +26,7 @@ from tkamb.run.columns import (
     CONTRIBUTIONS,
     JOINT_MOMENT,
     MUSCLE_FORCE,
+    PATELLA_LINE,
     RESERVE,
     family_column,
     ligament_column,
@@ -34,6 +41,7 @@ if TYPE_CHECKING:
     from tkamb.knee.contact_points import CondylePoint
     from tkamb.knee.crossing import MuscleShare
     from tkamb.knee.frame import Frame
+    from tkamb.knee.patella_equilibrium import FoundPatella
     from tkamb.knee.slip import CondyleSlip
 
 NAN = float("nan")
@@ -70,6 +78,8 @@ def frame_row(
         row |= _slip_row(case, k, side, slip, frame.geometry.condyles.get(side))
     if frame.button is not None:
         row |= _button_row(frame.button)
+    if case.patella_ligaments:
+        row |= _patella_row(case, frame.patella)
     if frame.pressed:
         row |= _contact_row(frame, case.yield_stress)
         row |= _pose_row(frame)
@@ -303,6 +313,22 @@ def _button_row(press: "ButtonPress") -> dict[str, float]:
         for side, facet in press.facets.items():
             values[f"{side}_force_N"] = 0.0 if facet is None else facet.force
     return {f"button_{name}": value for name, value in values.items()}
+
+
+def _patella_row(case: Case, found: "FoundPatella | None") -> dict[str, float]:
+    """Return coordinates and ligament tensions of the released patella; NaN: not found."""
+    lost = found is None or bool(found.problem)
+    balance = None if found is None or lost else found.balance
+    places = np.full(6, NAN) if balance is None else balance.coordinates
+    row = {"patella_residual_N": NAN if balance is None else balance.residual}
+    for name, value in zip(PATELLA_BODY_COORDINATES, places, strict=True):
+        is_place = name in ("ap", "si", "shift")
+        unit, size = ("mm", MILLIMETRE) if is_place else ("deg", DEGREE)
+        row[f"patella_{name}_{unit}"] = value / size
+    tensions = found.tensions if found else {}
+    for bundle in case.patella_ligaments:
+        row[family_column(PATELLA_LINE, bundle.name)] = tensions.get(bundle.name, NAN)
+    return row
 
 
 def _pose_row(frame: "Frame") -> dict[str, float]:

@@ -101,8 +101,8 @@ def panels(results: "Results") -> tuple[Panel, ...]:
     makers: tuple[Callable[[Results], Panel], ...] = (
         _total, _condyles, _share, _sensitivity, _extensor, _ratios, _areas, _pressures, _yield,
         _post, _button_force, _button_area, _button_pressure, _button_centre,
-        _external, _ground, _ligaments, _residuals, _residual_moment, _hip_force,
-        _hip_moment, _motion, _slip, _adjustment, _adjustment_effect,
+        _patella_shift, _patella_turns, _external, _ground, _ligaments, _residuals,
+        _residual_moment, _hip_force, _hip_moment, _motion, _slip, _adjustment, _adjustment_effect,
     )  # fmt: skip
     panels_made = (_without_empty_lines(make(results)) for make in makers)
     return tuple(panel for panel in panels_made if panel.lines)
@@ -347,6 +347,23 @@ def _button_centre(results: "Results") -> Panel:
     )
     note = "From the middle of the button's back."
     return Panel("button_centre", "Centre of pressure on the button", "mm", lines, note)
+
+
+def _patella_turns(results: "Results") -> Panel:
+    lines = (
+        _line(results, "patella_tilt_deg", "tilt", SUPERIOR),
+        _line(results, "patella_rotation_deg", "rotation", ANTERIOR),
+    )
+    note = (
+        "Tilt is positive if the lateral edge is nearer to the femur, rotation if the superior "
+        "pole is lateral."
+    )
+    return Panel("patella_turns", "Tilt and rotation of the patella", "deg", lines, note)
+
+
+def _patella_shift(results: "Results") -> Panel:
+    lines = (_line(results, "patella_shift_mm", "lateral", RIGHT),)
+    return Panel("patella_shift", "Shift of the patella", "mm", lines)
 
 
 def _external(results: "Results") -> Panel:

@@ -11,6 +11,7 @@ Number = Annotated[float, Strict()]
 Count = Annotated[int, Strict()]
 Switch = Annotated[bool, Strict()]
 Vector = tuple[Number, Number, Number]
+PatellaFreedom = Literal["ap", "si", "shift", "flexion", "tilt", "rotation"]
 KneeFreedom = Literal["ap", "si", "ml", "axial_rotation", "adduction"]
 Closing = Literal["interpolate", "there-and-back", "as recorded"]
 """How recorded frames become a cycle of wear, see `tkamb.studies.wear.motion`."""

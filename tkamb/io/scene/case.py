@@ -18,6 +18,7 @@ from tkamb.io.scene.parts import (
     ImplantParts,
     read_ligaments,
     read_muscles,
+    read_patella_lines,
     read_patellar_ligament,
 )
 from tkamb.io.scene.scene import Scene
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from tkamb.io.recordings.tibia import BodyMotion
     from tkamb.knee.ligaments import Ligament
     from tkamb.knee.muscles import Muscle, PatellarLigament
+    from tkamb.knee.patella_frame import HeadShare
 
 logger = logging.getLogger("tkamb")
 
@@ -57,6 +59,8 @@ class Case:
         post: the insert's post in the insert frame, if the scene has [contact] post.
         insert_placement: pose of the insert's mesh in the insert frame, after the mesh is turned
             to anatomical axes about its origin, not mirrored, m, shape (4, 4); None if not needed.
+        patella_heads: heads of the quadriceps of a released patella.
+        patella_ligaments: strands and retinacula of a released patella.
     """
 
     scene: Scene
@@ -74,6 +78,8 @@ class Case:
     emg: "Envelopes | None" = None
     post: "Surface | None" = None
     insert_placement: Array | None = None
+    patella_heads: "tuple[HeadShare, ...]" = ()
+    patella_ligaments: "tuple[Ligament, ...]" = ()
 
     @cached_property
     def split(self) -> float | None:
@@ -248,6 +254,7 @@ def load_case(scene: Scene) -> Case:
         emg,
         parts.post,
         parts.insert_placement,
+        *read_patella_lines(scene, parts, chain),
     )
     if scene.patient.scale == 1.0:
         return case

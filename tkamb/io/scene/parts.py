@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
     from tkamb.knee.ligaments import Ligament
     from tkamb.knee.muscles import Muscle, PatellarLigament, SagittalWrap
+    from tkamb.knee.patella_frame import HeadShare
     from tkamb.knee.wrap_object import WrapObject
 
 NAN = float("nan")
@@ -214,6 +215,49 @@ def read_ligaments(scene: Scene, parts: ImplantParts, chain: Chain) -> "tuple[Li
         names = scene.generic_ligaments.ligaments
         bundles += generic_ligaments(parts.femoral, parts.insert, chain.insert_in_tibia, names)
     return bundles
+
+
+def read_patella_lines(
+    scene: Scene, parts: ImplantParts, chain: Chain
+) -> "tuple[tuple[HeadShare, ...], tuple[Ligament, ...]]":
+    """Return the heads of the quadriceps and the ligaments of a released patella.
+
+    Raises:
+        InputError: a head does not run from the femur to the patella, a ligament has no end on the
+            patella, or none runs to the tibia.
+    """
+    table, is_left = scene.patella, scene.patient.side == "left"
+    if table is None or not table.released:
+        return (), ()
+    from tkamb.knee.patella_frame import HeadShare
+
+    lines = tuple(
+        replace(
+            ligament(one, is_left),
+            wraps=tuple(wrap_object(wrap, parts, chain, is_left) for wrap in one.wrap),
+        )
+        for one in table.ligament
+    )
+    joined = {line.name: {chain.carrier(link) for link in line.links} for line in lines}
+    for name, links in joined.items():
+        if "patella" not in links:
+            where = f"[[patella.ligament]] {name}"
+            raise InputError("has no end on the patella", where, "give it as [[ligament]]")
+    if not any({"patella", "tibia"} <= links for links in joined.values()):
+        hint = "give strands of the patellar ligament"
+        raise InputError("none runs from the patella to the tibia", "[[patella.ligament]]", hint)
+    heads = tuple(
+        HeadShare(
+            head.name, _point(head.origin, is_left), _point(head.insertion, is_left), head.share
+        )
+        for head in table.head
+    )
+    for head in heads:
+        ends = [chain.carrier(end.link) for end in (head.origin, head.insertion)]
+        if ends != ["femur", "patella"]:
+            where = f"[[patella.head]] {head.name}"
+            raise InputError(f"runs from {ends[0]} to {ends[1]}", where, "femur to patella")
+    return heads, lines
 
 
 def ligament(table: LigamentTable, left: bool = False) -> "Ligament":

@@ -54,6 +54,11 @@ def scaled_case(case: "Case") -> "Case":
         ligaments=tuple(_ligament(bundle, s) for bundle in case.ligaments),
         muscles=tuple(_muscle(muscle, s) for muscle in case.muscles),
         patellar_ligament=_patellar_ligament(case.patellar_ligament, s),
+        patella_heads=tuple(
+            replace(head, origin=_point(head.origin, s), insertion=_point(head.insertion, s))
+            for head in case.patella_heads
+        ),
+        patella_ligaments=tuple(_ligament(bundle, s) for bundle in case.patella_ligaments),
     )
 
 

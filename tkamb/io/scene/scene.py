@@ -144,6 +144,8 @@ class Scene(SceneTable):
         contact = self.contact
         if contact and contact.patellofemoral and not (self.implant.patella and self.patella):
             raise ValueError("[contact.patellofemoral] needs [implant.patella] and [patella]")
+        if self.patella and self.patella.released and not (contact and contact.patellofemoral):
+            raise ValueError("[patella] released needs [contact.patellofemoral]")
         if self.material and contact and "material" in contact.model_fields_set:
             raise ValueError("[material] and [contact] material name two materials: give one")
         own_yield = self.material is not None and self.material.yield_stress_MPa is not None

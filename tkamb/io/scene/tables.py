@@ -23,6 +23,7 @@ from tkamb.io.recordings.scene_table import (
     LengthUnit,
     Number,
     Offset,
+    PatellaFreedom,
     Point,
     SceneTable,
     Switch,
@@ -343,10 +344,49 @@ class PatellarLigamentTable(SceneTable):
     band_mm: Band = Field(5.0, description="as for a muscle, for the insert's lip")
 
 
+class PatellaHeadTable(SceneTable):
+    """A head of the quadriceps with its share of the quadriceps' tension.
+
+    It wraps the outline that the line of [quadriceps] wraps.
+    """
+
+    name: str = Field(pattern="^[A-Za-z0-9_]+$")
+    origin: Attachment
+    insertion: Attachment
+    share: Number = Field(gt=0, le=1, description="the shares of all heads sum to 1")
+
+
 class PatellaTable(SceneTable):
-    """The patella's sagittal motion: recorded, or solved from equilibrium."""
+    """The patella's sagittal motion: recorded, or solved from equilibrium.
+
+    With `released` the patella leaves this plane pose: these coordinates are found in equilibrium
+    of the heads of the quadriceps, the ligaments of the patella and the contact of the button. The
+    equations of the knee keep the plane patella and its inextensible ligament.
+    """
 
     motion: Literal["recorded", "solved"]
+    released: tuple[PatellaFreedom, ...] = Field(
+        (), description="coordinates of the patella in equilibrium; needs [contact.patellofemoral]"
+    )
+    head: tuple[PatellaHeadTable, ...] = Field(
+        (), description="heads of the quadriceps; default: the line of [quadriceps] alone"
+    )
+    ligament: tuple[LigamentTable, ...] = Field(
+        (),
+        description="strands of the patellar ligament (patella to tibia) and retinacula (patella "
+        "to femur or tibia); they act on the released patella only",
+    )
+
+    @model_validator(mode="after")
+    def _released_with_ligaments(self) -> Self:
+        if bool(self.released) != bool(self.ligament) or (self.head and not self.released):
+            raise ValueError("'released' needs [[patella.ligament]], and the other way round")
+        names = [one.name for one in self.head] + [one.name for one in self.ligament]
+        if len(set(names)) < len(names) or len(set(self.released)) < len(self.released):
+            raise ValueError("a head, ligament or released coordinate is named twice")
+        if self.head and abs(sum(head.share for head in self.head) - 1.0) > 1e-6:
+            raise ValueError("the shares of the heads do not sum to 1")
+        return self
 
 
 class PatellofemoralTable(SceneTable):
