@@ -1,4 +1,9 @@
-"""Femoral components and inserts with known curvature, m, in the axes of the insert frame."""
+"""Femoral components and inserts with known curvature, m, in the axes of the insert frame.
+
+Bodies of the same sizes are one object for all tests, with their search trees.
+"""
+
+from functools import lru_cache
 
 import numpy as np
 
@@ -7,6 +12,7 @@ from tkamb.geometry.surface import Surface
 SECTORS = 96
 
 
+@lru_cache(8)
 def graded_sphere(radius, centre=(0.0, 0.0, 0.0), stretch=(1.0, 1.0, 1.0)):
     """Return a sphere with rings 0.15 deg apart near the lower pole.
 
@@ -42,6 +48,7 @@ def graded_sphere(radius, centre=(0.0, 0.0, 0.0), stretch=(1.0, 1.0, 1.0)):
     return surface
 
 
+@lru_cache(8)
 def joined(*surfaces):
     """Return several surfaces as one."""
     start = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
@@ -74,6 +81,7 @@ def dished_insert(height, half_x=15e-3, half_z=15e-3, spacing=0.5e-3):
     return surface
 
 
+@lru_cache(8)
 def flat_insert(height, half_x=15e-3, half_z=15e-3):
     """Return a box of a height (m) on y = 0."""
     return dished_insert(lambda x, z: height + 0 * x, half_x, half_z, spacing=2 * half_x)

@@ -1,5 +1,6 @@
 """Inserts for lattice tests: synthetic inserts with holes, posts and rims, and real inserts."""
 
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,7 @@ def raised(x, z, height, solid):
     return Surface(points, number.reshape(-1, 3), "insert")
 
 
+@lru_cache(8)
 def dished(size=(0.04, 0.06), lip=0.012, dish=0.006, spacing=5e-4, radius=0.035):
     """Return a block with two spherical dishes, and its exact top as a function of x and z."""
 
@@ -52,6 +54,7 @@ def dished(size=(0.04, 0.06), lip=0.012, dish=0.006, spacing=5e-4, radius=0.035)
     return raised(x, z, height, np.ones((len(x) - 1, len(z) - 1), bool)), top
 
 
+@cache
 def real_insert(name):
     """Return the insert of DM or JW in the insert frame; skip the test without the data."""
     path = DATA / name / "geometry" / "tibial_insert.stl"
@@ -61,6 +64,7 @@ def real_insert(name):
     return surface.moved(insert_placement(surface))
 
 
+@cache
 def shipped_insert():
     """Return the insert of the shipped deep knee bend, in the insert frame."""
     path = Path(__file__).parents[1] / "models" / "deep_knee_bend" / "insert.stl"

@@ -1,5 +1,7 @@
 """Knees with known solutions: two rigid spheres on an elastic foundation, flat or dished."""
 
+from functools import cache
+
 import numpy as np
 
 from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
@@ -22,10 +24,12 @@ def spheres():
     return joined(*(graded_sphere(BALL, (0, 0, side * HALF)) for side in (-1, 1)))
 
 
+@cache
 def flat_joint():
     return ContactPair(spheres(), flat_insert(HEIGHT, 12e-3, 34e-3), LINEAR)
 
 
+@cache
 def dished_joint(radius=DISH):
     def height(x, z):
         return HEIGHT + radius - np.sqrt(radius**2 - x**2 - (np.abs(z) - HALF) ** 2)

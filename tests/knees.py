@@ -5,10 +5,9 @@ from scipy.spatial.transform import Rotation
 
 from tkamb.geometry.frames import pose, transform
 from tkamb.knee.chain import Chain, ChainMotion
-from tkamb.knee.contact_points import CondylePoint
 from tkamb.knee.equations import Extensor, KneeGeometry
 from tkamb.knee.load import PointForces
-from tkamb.knee.unknowns import Unknown
+from tkamb.knee.unknowns import CondylePoint, Unknown
 
 INERTIA = {
     "tibia": (4.2, "0.01 0.22 0.005", "0.06 0.008 0.061 0.001 0.0004 -0.0006"),

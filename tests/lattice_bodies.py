@@ -1,4 +1,6 @@
-"""Bodies for the lattice's contact tests."""
+"""Bodies for the lattice's contact tests; bodies of the same sizes are one object."""
+
+from functools import lru_cache
 
 import numpy as np
 import trimesh
@@ -7,6 +9,7 @@ from tkamb.contact.pair import ContactPair
 from tkamb.geometry.surface import Surface
 
 
+@lru_cache(8)
 def box_insert(width, height, depth):
     """Return a box on y = 0 (sizes in m)."""
     box = trimesh.creation.box((width, height, depth))
@@ -19,6 +22,7 @@ def plate(width, depth):
     return box_insert(width, 5e-3, depth)
 
 
+@lru_cache(8)
 def sphere_cap(radius, reach=6e-3, step=1e-4, sectors=96):
     """Return the lower cap of a sphere about the origin, finely triangulated (sizes in m)."""
     count = int(reach / step)
@@ -38,6 +42,7 @@ def sphere_cap(radius, reach=6e-3, step=1e-4, sectors=96):
     return Surface(np.vstack([[0, -radius, 0], rim]), np.concatenate(faces), "cap")
 
 
+@lru_cache(8)
 def dished_insert(width=24e-3, depth=40e-3, height=9e-3, radius=30e-3, cells=48):
     """Return a closed insert with two dishes at z = ±depth/4 (sizes in m)."""
     x = np.linspace(-width / 2, width / 2, cells + 1)
@@ -67,6 +72,7 @@ def dished_insert(width=24e-3, depth=40e-3, height=9e-3, radius=30e-3, cells=48)
     return Surface(np.array(mesh.vertices), np.array(mesh.faces, np.int64), "dished insert")
 
 
+@lru_cache(8)
 def condyles(radius=20e-3, offset=10e-3, subdivisions=5):
     """Return two spheres as a femoral component (sizes in m)."""
     ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)

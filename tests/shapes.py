@@ -1,6 +1,7 @@
 """Synthetic bodies for tests, in metres and anatomical axes."""
 
 from collections.abc import Callable
+from functools import lru_cache
 
 import numpy as np
 import trimesh
@@ -40,16 +41,19 @@ def block(
     return Surface(np.concatenate([top, bottom]), faces.astype(np.int64), name)
 
 
+@lru_cache(8)
 def plate(thickness: float = 0.01, spacing: float = 2e-3) -> Surface:
     """Return a flat block."""
     return block(lambda x, z: np.full_like(x, thickness), spacing=spacing)
 
 
+@lru_cache(8)
 def trough(radius: float, depth: float = 0.006, spacing: float = 1e-3) -> Surface:
     """Return a block with a cylindrical trough along z; its lowest line is at y = `depth`."""
     return block(lambda x, z: depth + radius - np.sqrt(radius**2 - x**2), 0.03, 0.04, spacing)
 
 
+@lru_cache(8)
 def two_dishes(radius: float = 0.05, apart: float = 0.044, depth: float = 0.006) -> Surface:
     """Return a block with two spherical dishes, with centres `apart` (m) along z."""
 
@@ -60,6 +64,7 @@ def two_dishes(radius: float = 0.05, apart: float = 0.044, depth: float = 0.006)
     return block(height, 0.044, 0.076)
 
 
+@lru_cache(8)
 def sphere(radius: float, subdivisions: int = 4, centre: tuple = (0.0, 0.0, 0.0)) -> Surface:
     """Return a triangulated sphere; its vertices lie on the exact sphere."""
     ball = trimesh.creation.icosphere(subdivisions, radius)
@@ -73,12 +78,14 @@ def joined(*parts: Surface) -> Surface:
     return Surface(np.concatenate([part.vertices for part in parts]), np.concatenate(faces))
 
 
+@lru_cache(8)
 def torus_condyle(sagittal: float, frontal: float, z: float) -> Surface:
     """Return a torus about the z axis: outer radius `sagittal`, radius of the tube `frontal`."""
     ring = trimesh.creation.torus(sagittal - frontal, frontal, 64, 32)
     return Surface(np.add(ring.vertices, [0.0, 0.0, z]), np.asarray(ring.faces), "torus")
 
 
+@lru_cache(8)
 def bicondylar(kind: str = "sphere", apart: float = 0.044) -> Surface:
     """Return two condyles and a bridge between them, in front and above (x > 0)."""
     bridge = trimesh.creation.box((0.008, 0.02, apart))

@@ -11,10 +11,12 @@ import logging
 import os
 from collections import OrderedDict
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 
 import pytest
 
+from tkamb.geometry import closest
 from tkamb.geometry.surface import Surface
 from tkamb.io import mesh_files
 from tkamb.io.importing import patient
@@ -23,6 +25,8 @@ from tkamb.run import press
 
 MOST = 24
 """Number of meshes whose surfaces are kept."""
+LARGEST = 100_000_000
+"""Bytes of the largest mesh file that is shared."""
 MOST_POSES = 4
 """Number of poses in which a surface is kept."""
 
@@ -45,6 +49,7 @@ def shared_surfaces():
         for module in (meshes, press, mesh_files, patient):
             patch.setattr(module, "load_surface", load)
         patch.setattr(Surface, "moved", _moving(Surface.moved))
+        patch.setattr(closest, "ClosestPointQuery", lru_cache(8)(closest.ClosestPointQuery))
         yield store
 
 
@@ -54,7 +59,8 @@ def _loading(load, store):
 
     def shared(path, *arguments, **named):
         given = options.bind(path, *arguments, **named).arguments
-        if not os.path.isfile(path):  # a name may be too long
+        # A name may be too long, and a file too large to be read.
+        if not os.path.isfile(path) or os.path.getsize(path) > LARGEST:
             return load(path, *arguments, **named)
         content = hashlib.sha256(Path(path).read_bytes()).hexdigest()
         key = (content, Path(path).suffix, *(repr(v) for k, v in given.items() if k != "path"))

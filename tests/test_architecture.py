@@ -17,6 +17,7 @@ ON_TOP = {"__init__", "__main__", "cli", "crocoddyl", "crocoddyl_pair", "testing
 """Modules that may import every folder."""
 
 
+@cache
 def imported(path):
     """Return the tkamb modules that a file imports, except for type checking.
 

@@ -38,6 +38,6 @@ def test_an_error_names_the_argument_in_python_and_the_option_of_the_command(
 def test_a_foreign_folder_is_refused_in_the_words_of_the_caller(tmp_path, capsys):
     (tmp_path / "diary.txt").write_text("mine")
     with pytest.raises(InputError, match="another directory, or give force=True"):
-        tkamb.simulate(SCENE, frames=slice(0, 1), directory=tmp_path)
-    assert main(["run", str(SCENE), "--out", str(tmp_path)]) == 2
+        tkamb.simulate(SCENE, contact="foundation", frames=slice(0, 1), directory=tmp_path)
+    assert main(["run", str(SCENE), "--contact", "foundation", "--out", str(tmp_path)]) == 2
     assert "choose another folder with --out, or give --force" in capsys.readouterr().err

@@ -13,10 +13,9 @@ from tkamb.contact.materials import material
 from tkamb.contact.registry import contact_model
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
-from tkamb.knee.contact_points import CondylePoint
 from tkamb.knee.equations import EQUATION, solve_knee
 from tkamb.knee.ligament_laws import QuadraticToe, TwoLine
-from tkamb.knee.unknowns import residuals
+from tkamb.knee.unknowns import CondylePoint, residuals
 from tkamb.run.read_scene import recording_of
 
 FRICTION = 0.05

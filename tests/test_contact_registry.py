@@ -95,7 +95,7 @@ def test_a_name_clash_is_an_error(name, monkeypatch):
         EntryPoint(name, "first.module:Model", "tkamb.contact"),
         EntryPoint(name, "second.module:Model", "tkamb.contact"),
     ]
-    monkeypatch.setattr(named_classes, "entry_points", lambda group: points)
+    monkeypatch.setattr(named_classes, "installed", lambda group, path: points)
     with pytest.raises(InputError, match=f"two contact models are called '{name}'"):
         contact_names()
 
@@ -103,7 +103,7 @@ def test_a_name_clash_is_an_error(name, monkeypatch):
 @pytest.mark.parametrize("value", ["not_there.at_all:Model", "tkamb.units:DEGREE"])
 def test_an_entry_point_that_is_not_a_model_is_an_input_error(value, monkeypatch):
     point = EntryPoint("broken", value, "tkamb.contact")
-    monkeypatch.setattr(named_classes, "entry_points", lambda group: [point])
+    monkeypatch.setattr(named_classes, "installed", lambda group, path: [point])
     with pytest.raises(InputError, match="contact model 'broken'"):
         contact_class("broken")
     assert "broken" in contact_descriptions()["broken"]

@@ -1,6 +1,7 @@
 """Elastic foundation, its columns and the press, against closed forms."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,7 @@ M = LINEAR.confined_modulus
 RADIUS, HEIGHT = 30e-3, 10e-3
 
 
+@cache
 def sphere_on_block(chosen=LINEAR):
     return ContactPair(graded_sphere(RADIUS), flat_insert(HEIGHT), chosen)
 
@@ -159,6 +161,7 @@ def test_the_force_does_not_depend_on_the_femoral_frame():
     assert np.allclose(result.pressure, expected.pressure, rtol=1e-6, atol=1.0)
 
 
+@cache
 def two_spheres(gap=24e-3):
     return joined(
         graded_sphere(20e-3, (0, 0, -gap / 2)),
@@ -353,6 +356,7 @@ def test_a_failed_guess_or_one_with_other_map_points_is_not_used():
         np.testing.assert_allclose(result.approach, alone.approach, rtol=1e-6)
 
 
+@cache
 def two_dishes():
     """Return a rounded, two-condyle component in two dishes: normals of both bodies differ."""
     insert = dished_insert(

@@ -96,7 +96,7 @@ def test_curvature_error_shrinks_with_the_patch():
 
 
 def test_an_ellipsoid_in_a_dish_has_the_force_and_peak_of_hertz():
-    stretch = np.sqrt([1.2, 1.0, 1.6])
+    stretch = tuple(np.sqrt([1.2, 1.0, 1.6]))
     femoral = graded_sphere(20e-3, stretch=stretch)
     insert = dished_insert(lambda x, z: 9e-3 + x**2 / (2 * 60e-3) + z**2 / (2 * 90e-3))
     model = Hertz(patch_radius=3e-3)

@@ -18,8 +18,8 @@ from tkamb.io.recordings.patient import load_urdf
 from tkamb.io.scene.case import Case, load_case
 from tkamb.io.scene.parts import ligament, read_muscles, read_patellar_ligament
 from tkamb.io.scene.scene import Scene, load_scene
-from tkamb.knee import contact_points, patellofemoral
 from tkamb.knee import equations as knee
+from tkamb.knee import patellofemoral, unknowns
 from tkamb.knee.chain import Chain
 from tkamb.knee.frame import Frame
 from tkamb.run.read_scene import recording_of
@@ -248,9 +248,9 @@ def scaled_case(case: Case) -> Case:
 def test_other_units_give_the_dimensionally_scaled_answer(monkeypatch):
     """Lengths, masses, times and gravity of the case are scaled, and lengths in the settings."""
     unscaled = shipped_loads()  # before the settings are scaled
-    speed = contact_points.CONTACT_POINT.standstill_speed * LENGTH / TIME
-    contact_point = replace(contact_points.CONTACT_POINT, standstill_speed=speed)
-    monkeypatch.setattr(contact_points, "CONTACT_POINT", contact_point)
+    speed = unknowns.CONTACT_POINT.standstill_speed * LENGTH / TIME
+    contact_point = replace(unknowns.CONTACT_POINT, standstill_speed=speed)
+    monkeypatch.setattr(unknowns, "CONTACT_POINT", contact_point)
     own_lengths = {
         (knee, "EQUATION"): ("residual_shift",),
         (patellofemoral, "PATELLOFEMORAL"): ("patch_depth", "sample_spacing", "sample_range"),

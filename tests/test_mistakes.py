@@ -230,7 +230,7 @@ def test_no_random_mistake_is_silent(knee):
 
 @needs_dm
 def test_no_random_mistake_is_silent_on_dm(dm):
-    assert_none_passes(dm, np.random.default_rng(1), (6, 6))
+    assert_none_passes(dm, np.random.default_rng(1), (3, 3))
 
 
 def turned_axes():

@@ -151,7 +151,7 @@ class MyStudy(Preset):
 def test_another_package_can_offer_a_preset(scene_file, monkeypatch):
     points = [EntryPoint("my-study", f"{__name__}:MyStudy", "tkamb.io.presets")]
     monkeypatch.setitem(sys.modules, __name__, SimpleNamespace(MyStudy=MyStudy))
-    monkeypatch.setattr(named_classes, "entry_points", lambda group: points)
+    monkeypatch.setattr(named_classes, "installed", lambda group, path: points)
     assert PRESETS.names() == (SOURCE, "my-study")
     assert load_scene(scene_file, preset="my-study").contact.friction == 0.1
 

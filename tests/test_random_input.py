@@ -23,6 +23,7 @@ GENTLE = settings(
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
+COARSE = ("--contact", "foundation", "--resolution", "3")
 SCENE = tomllib.loads(fast_scene().read_text(encoding="utf-8"))
 NUMBERS = st.one_of(
     st.floats(allow_nan=False, allow_infinity=False), st.integers(-(10**6), 10**6), st.just(0.0)
@@ -88,7 +89,7 @@ def refusal(file):
     return ""
 
 
-@settings(GENTLE, max_examples=150)
+@settings(GENTLE, max_examples=75)
 @given(st.sampled_from(PATHS), st.none() | VALUES)
 def test_a_scene_with_a_random_key_is_read_or_refused(path, value):
     with tempfile.TemporaryDirectory() as name:
@@ -120,7 +121,7 @@ def test_a_run_of_a_scene_with_a_random_number(capsys, path, value):
         shutil.copytree(MODEL, name, dirs_exist_ok=True)
         file = Path(name) / "scene.toml"
         file.write_text(as_toml(changed(SCENE, path, value)), encoding="utf-8")
-        run_cleanly(Path(name), capsys, "--contact", "foundation", "--resolution", "3")
+        run_cleanly(Path(name), capsys, *COARSE)
 
 
 CELLS = st.sampled_from(["", "nan", "inf", "-1e300", "1e9", "0", "abc", "1,2", '"', "\x00", "é"])
@@ -142,7 +143,7 @@ def test_a_run_with_a_random_cell_in_its_tables(capsys, name, row, column, cell)
         cells[column % len(cells)] = cell
         lines[min(row, len(lines) - 1)] = ",".join(cells)
         (folder / name).write_text("\n".join(lines) + "\n")
-        run_cleanly(folder, capsys, "--contact", "foundation", "--resolution", "3")
+        run_cleanly(folder, capsys, *COARSE)
 
 
 @settings(GENTLE, max_examples=4)
@@ -157,7 +158,7 @@ def test_a_press_of_random_meshes(capsys, name, how, seed):
         shutil.copytree(MODEL, folder, dirs_exist_ok=True)
         damage(folder / name, how, np.random.default_rng(seed))
         files = [str(folder / part) for part in ("femoral_component.stl", "insert.stl")]
-        status = main(["press", *files, "--load", "800", "--resolution", "3", "--json"])
+        status = main(["press", *files, "--load", "800", *COARSE, "--json"])
         output = capsys.readouterr().err
         assert status in (0, 1, 2)
         assert "Traceback" not in output

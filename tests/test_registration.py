@@ -109,14 +109,14 @@ def errors_of(placement_mm, seeds):
 
 def test_stated_deviations_contain_the_truth():
     """90 % of the positions lie within 1.645 deviations, for markers 15 mm from the model."""
-    markers, hips, scores = errors_of(15.0, range(6))
+    markers, hips, scores = errors_of(15.0, range(4))
     assert 0.82 < np.mean(np.abs(scores) < 1.645) < 0.98
     assert np.sqrt(np.mean(markers**2)) < 7.0 * MILLIMETRE
     assert np.sqrt(np.mean(np.sum(hips**2, axis=1))) < 10.0 * MILLIMETRE
 
 
 def test_markers_that_hands_place_well_are_found_within_4_mm():
-    markers, _, _ = errors_of(5.0, range(4))
+    markers, _, _ = errors_of(5.0, range(2))
     assert np.sqrt(np.mean(markers**2)) < 4.0 * MILLIMETRE
 
 

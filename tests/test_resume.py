@@ -132,7 +132,7 @@ def test_a_run_killed_at_random_times_has_the_results_of_an_undisturbed_run(tmp_
 )
 def test_a_lattice_depends_on_its_warm_start_within_the_stated_tolerance(workers, stops):
     """The run is interrupted and resumed, with one and two workers."""
-    options = {"contact": "lattice", "resolution_mm": 4.0, "frames": slice(20, 44, 2)}
+    options = {"contact": "lattice", "resolution_mm": 4.0, "frames": slice(20, 36, 2)}
     reference = simulate(fast_scene(), **options)
     results = interrupted(fast_scene(), stops, workers=workers, **options)
     assert max(deviations(results, reference).values()) <= 1.0

@@ -16,13 +16,8 @@ from tkamb.run.simulation import simulate
 from tkamb.run.workers import PoolOptions, Task
 
 SCENE = fast_scene()
+FRAMES = slice(0, 101, 12)
 EFFORT = ("body_seconds", "query_seconds", "contact_seconds", "iterations")
-
-
-@pytest.fixture(scope="module")
-def serial():
-    """Return the results of a run in one process."""
-    return simulate(SCENE, frames=slice(0, 101, 8))
 
 
 def numbers(results):
@@ -30,8 +25,41 @@ def numbers(results):
     return {name: results[name] for name in results.columns if KINDS.get(name) != "text"}
 
 
-def test_two_workers_have_the_results_of_one_process(serial, tmp_path):
-    shared = simulate(SCENE, frames=slice(0, 101, 8), directory=tmp_path / "out", workers=2)
+def doubled_facet(folder):
+    """Return the shipped scene with an insert that is read with a warning."""
+    scene, record = write_scene(folder), 50
+    mesh = scene.parent / "insert.stl"
+    content = mesh.read_bytes()
+    count = int.from_bytes(content[80:84], "little") + 1
+    duplicate = content[84 : 84 + record]
+    mesh.write_bytes(content[:80] + count.to_bytes(4, "little") + content[84:] + duplicate)
+    return scene
+
+
+def test_two_workers_resumed_with_one_have_the_results_of_one_process(
+    tmp_path, caplog, capfd, monkeypatch
+):
+    """Two workers are interrupted. Their frames, and the last ones, are those of one process.
+
+    Workers do not repeat the warnings of this process.
+    """
+    computed, scene, out = [], doubled_facet(tmp_path / "knee"), tmp_path / "out"
+
+    def stop_after(frames):
+        for k in frames:
+            if len(computed) == 7:
+                raise KeyboardInterrupt
+            computed.append(k)
+            yield k
+
+    with pytest.raises(KeyboardInterrupt, match="7 of 9 frames are kept"):
+        simulate(scene, frames=FRAMES, directory=out, workers=2, progress=stop_after)
+    assert [message for message in caplog.messages if "duplicate" in message]
+    assert "duplicate" not in capfd.readouterr().err
+    shared = simulate(scene, frames=FRAMES, directory=out, resume=True)
+    assert shared.summary["resumed_frames"] == 7 and shared.summary["unfinished_frames"] == 0
+    assert np.isfinite(read_results(out)["force_total_BW"]).all()
+    serial = simulate(SCENE, frames=FRAMES)
     assert list(shared["status"]) == list(serial["status"])
     for name, values in numbers(shared).items():
         if name not in EFFORT:
@@ -47,24 +75,6 @@ def test_a_bad_number_of_workers_is_refused_before_the_folder_is_created(tmp_pat
     assert main(["run", str(SCENE), "--workers", "0", "--out", str(tmp_path / "out")]) == 2
     assert "--workers" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
-
-
-def test_a_run_with_two_workers_is_resumed_with_one(tmp_path, monkeypatch):
-    computed = []
-
-    def stop_after(frames):
-        for k in frames:
-            if len(computed) == 11:
-                raise KeyboardInterrupt
-            computed.append(k)
-            yield k
-
-    out, frames = tmp_path / "out", slice(0, 101, 8)
-    with pytest.raises(KeyboardInterrupt, match="11 of 13 frames are kept"):
-        simulate(SCENE, frames=frames, directory=out, workers=2, progress=stop_after)
-    results = simulate(SCENE, frames=frames, directory=out, resume=True)
-    assert results.summary["resumed_frames"] == 11 and results.summary["unfinished_frames"] == 0
-    assert np.isfinite(read_results(out)["force_total_BW"]).all()
 
 
 def test_a_pool_starts_its_workers_immediately_and_ends_them_with_its_block():
@@ -93,15 +103,3 @@ def test_an_error_in_a_job_is_raised_by_the_caller():
         list(
             PoolOptions(2).answers(Task(functools.partial, (PoolOptions,)), [(0, None), (0, None)])
         )
-
-
-def test_workers_do_not_repeat_warnings(tmp_path, caplog, capfd):
-    scene = write_scene(tmp_path / "knee")
-    mesh = scene.parent / "insert.stl"
-    content, record = mesh.read_bytes(), 50
-    count = int.from_bytes(content[80:84], "little") + 1
-    duplicate = content[84 : 84 + record]
-    mesh.write_bytes(content[:80] + count.to_bytes(4, "little") + content[84:] + duplicate)
-    simulate(scene, frames=slice(0, 96, 8), workers=2)
-    assert [message for message in caplog.messages if "duplicate" in message]
-    assert "duplicate" not in capfd.readouterr().err

@@ -30,10 +30,17 @@ def script():
     return module
 
 
+@pytest.fixture(scope="module")
+def kept_meshes():
+    """Read the meshes of all scenes once."""
+    with pytest.MonkeyPatch.context() as patch:
+        keep_meshes(patch)
+        yield
+
+
 @pytest.fixture
-def attempt(script, tmp_path, monkeypatch):
-    """Return a function that tries a scene's content in a new folder; meshes are read once."""
-    keep_meshes(monkeypatch)
+def attempt(script, tmp_path, kept_meshes):
+    """Return a function that tries a scene's content in a new folder."""
     handler = signal.signal(signal.SIGPROF, script._too_long)
     yield lambda content: script.attempt(as_toml(content), tmp_path / "scene.toml")
     signal.signal(signal.SIGPROF, handler)

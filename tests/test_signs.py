@@ -81,7 +81,7 @@ def test_both_scenes_of_dm_raise_no_question_of_sign(scene):
         ("scene.toml", "rotation_1"),
         ("scene.toml", "rotation_2"),
         pytest.param("mirrored.toml", "rotation_1", marks=pytest.mark.slow),
-        ("mirrored.toml", "rotation_2"),
+        pytest.param("mirrored.toml", "rotation_2", marks=pytest.mark.slow),
     ],
 )
 def test_one_turned_rotation_of_dm_is_asked_about(scene, role):

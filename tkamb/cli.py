@@ -156,7 +156,8 @@ def _run(options: argparse.Namespace) -> int:
     from tkamb.show.report import report_html
 
     scene = _scene_of(options)
-    directory = options.out or scene.output.directory or _default_directory(options.scene)
+    default = Path("out") / options.scene.resolve().parent.name
+    directory = options.out or scene.output.directory or default
     with Stages(4) as stages, claimed_directory(directory, options.force, "run"):
         results = simulate(
             scene,
@@ -195,7 +196,6 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _scene_of(options: argparse.Namespace) -> "Scene":
-    """Return the scene of `run`, with the overrides of the command line."""
     from tkamb.io.scene import load_scene
 
     overrides = overrides_of(options)
@@ -208,10 +208,6 @@ def _scene_of(options: argparse.Namespace) -> "Scene":
         overrides | {f"contact.options.{k}": v for k, v in cache_options.items()},
         options.preset,
     )
-
-
-def _default_directory(scene: Path) -> Path:
-    return Path("out") / scene.resolve().parent.name
 
 
 def _scene(options: argparse.Namespace) -> int:

@@ -164,7 +164,6 @@ class KneeDynamics(crocoddyl.DifferentialActionModelAbstract):
         return self.tensions | dict(zip(self.muscles, controls, strict=True))
 
     def _force(self, data: "KneeDynamicsData", q: Array, v: Array, tensions: Any) -> Array:
-        """Return the generalised force (nv,) of the knee."""
         forces = self.knee.external_forces(q, v, tensions, data.knee)
         jacobians, total = data.knee.data, np.zeros(self.state.nv)
         pin.computeJointJacobians(self.knee.model, jacobians, q)
@@ -336,14 +335,12 @@ class _CondyleResidual(crocoddyl.ResidualModelAbstract):
         self._data = knee.create_data()
 
     def calc(self, data: Any, x: Array, u: Array | None = None) -> None:
-        """Set the values."""
         try:
             data.r = self._values(x[: self.state.nq])
         except ComputationError:
             data.r = np.full(2, np.nan)
 
     def calcDiff(self, data: Any, x: Array, u: Array | None = None) -> None:
-        """Set the derivative of the values by x."""
         try:
             by_q = self._slopes(x[: self.state.nq])
         except ComputationError:

@@ -3,7 +3,7 @@
 import difflib
 from collections.abc import Iterable
 
-# Largest number of names in a message. Chosen because a message should be short.
+# Largest number of names in a message. A message should be short.
 MAX_NAMES = 8
 
 

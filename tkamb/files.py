@@ -32,12 +32,12 @@ from tkamb.errors import InputError
 MEGABYTE = 1_000_000
 
 
-# bytes: largest scene, URDF or summary. Chosen because the shipped files are a thousand times
+# bytes: largest scene, URDF or summary. The shipped files are a thousand times
 # smaller.
 TEXT_BYTES = 16 * MEGABYTE
-# bytes: largest recording. Chosen because an hour of fifty channels at 200 Hz has 500 MB.
+# bytes: largest recording. An hour of fifty channels at 200 Hz has 500 MB.
 TABLE_BYTES = 512 * MEGABYTE
-# bytes: largest mesh. Chosen because twenty million triangles in a binary STL have this size.
+# bytes: largest mesh. Twenty million triangles in a binary STL have this size.
 MESH_BYTES = 1000 * MEGABYTE
 # Largest depth of nested elements in an XML file. A URDF has 5, an OpenSim model 20.
 XML_DEPTH = 100
@@ -60,7 +60,6 @@ def open_regular(path: str | Path, limit: float, *, what: str = "file", follow: 
     """Return a descriptor of a regular file of at most `limit` bytes, opened for reading.
 
     Args:
-        path: the file.
         limit: largest size, bytes.
         what: kind of file, for messages.
         follow: whether the path may be a symbolic link.
@@ -209,14 +208,12 @@ class _ShallowBuilder(TreeBuilder):
         self._path, self._depth = path, 0
 
     def start(self, tag: str, attrs: dict[str, str], /) -> Element:
-        """Open an element."""
         self._depth += 1
         if self._depth > XML_DEPTH:
             raise InputError(f"nests elements more than {XML_DEPTH} deep", self._path)
         return super().start(tag, attrs)
 
     def end(self, tag: str, /) -> Element:
-        """Close an element."""
         self._depth -= 1
         return super().end(tag)
 
@@ -258,7 +255,6 @@ def sha256_of(path: str | Path, limit: float = HASH_LIMIT) -> str:
     """Return the SHA-256 of a regular file's content, hexadecimal.
 
     Args:
-        path: the file.
         limit: largest size, bytes.
 
     Raises:
@@ -488,7 +484,6 @@ def undamaged(path: str | Path, hint: str = "run it again") -> Iterator[None]:
     writes it.
 
     Args:
-        path: the file.
         hint: what to do.
 
     Raises:

@@ -26,8 +26,8 @@ BLOCK = (32e-3, 10e-3, 56e-3)
 """m: lengths of the block along x, y and z."""
 
 
-# 1: largest relative difference between the stiffnesses over ±10 and ±5 % of the approach. Chosen
-# because the force has small steps when single nodes come into contact.
+# 1: largest relative difference between the stiffnesses over ±10 and ±5 % of the approach.
+# The force has small steps when single nodes come into contact.
 STIFFNESS_TOLERANCE = 0.1
 
 

@@ -201,7 +201,6 @@ def add_import(commands: Any) -> None:
 
 
 def _add_inferred(command: argparse.ArgumentParser) -> None:
-    """Add the options that replace values inferred from the files."""
     command.add_argument("--knee", metavar="JOINT", help="name of the model's femorotibial joint")
     command.add_argument(
         "--plates",
@@ -247,7 +246,6 @@ def _add_inferred(command: argparse.ArgumentParser) -> None:
 
 
 def _add_poses(command: argparse.ArgumentParser) -> None:
-    """Add the options of recorded poses of the implant."""
     command.add_argument(
         "--poses",
         type=Path,

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from tkamb.run.guard import say
 
-# Largest number of failed runs that are printed; the folder lists all. Chosen because ten lines
+# Largest number of failed runs that are printed; the folder lists all. Ten lines
 # fit on a screen.
 MAX_FAILED_RUNS = 10
 

@@ -7,10 +7,10 @@ from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.frames import Array, Index
 
 # 1: share of a triangle's side that counts as in contact where the edge of contact is unknown: the
-# femoral surface ends between the side's nodes, or is steeper than 45 deg. Chosen because contact
+# femoral surface ends between the side's nodes, or is steeper than 45 deg. Contact
 # may end anywhere between the nodes.
 UNKNOWN_EDGE_SHARE = 0.5
-# m: smallest gap of a node that is not in contact. Chosen because it prevents a division by zero;
+# m: smallest gap of a node that is not in contact. It prevents a division by zero;
 # gaps that matter are above 1e-7 m.
 LEAST_GAP = 1e-12
 

@@ -38,10 +38,10 @@ TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 UP = np.array([0.0, 1.0, 0.0])
 
 
-# m: height above the post at which rays along -y' begin. Chosen because it is well above the noise
+# m: height above the post at which rays along -y' begin. It is well above the noise
 # of a mesh.
 RAY_START_HEIGHT = 1e-3
-# m: distance beside the post up to which triangles belong to the cam. Chosen because the femur
+# m: distance beside the post up to which triangles belong to the cam. The femur
 # moves from side to side.
 SEARCH_MARGIN = 3 * MILLIMETRE
 
@@ -105,7 +105,6 @@ class PostContact:
         gap: m, along x between cam and post; negative if they overlap.
         area: m², contact area.
         peak_pressure: Pa.
-        flags: warnings in words.
         problem: reason why there is no result; empty if there is one.
     """
 
@@ -133,7 +132,6 @@ class CamPost:
     """A contact model that is prepared for a cam and a post.
 
     Args:
-        model: the contact model.
         femoral: femoral component with its cam, femoral frame.
         post: closed post, insert frame, flat in front (`divide_insert`).
         split: z (m, femoral frame) between the condyles.

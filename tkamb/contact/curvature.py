@@ -13,12 +13,12 @@ class CurvatureSettings:
     """Curvature of the two surfaces at a contact point, from a patch of rays."""
 
     samples: int = 21
-    """Number of rays along the diameter of a patch. Chosen because about 350 rays for the six
+    """Number of rays along the diameter of a patch. About 350 rays for the six
     coefficients of a quadric average out the facets of a mesh."""
     max_iterations: int = 12
     """Largest number of iterations for the contact point. Not studied."""
     position_tolerance: float = 1e-7
-    """m: the contact point has converged when an iteration moves it by less. Chosen because it is
+    """m: the contact point has converged when an iteration moves it by less. It is
     far below the size of a triangle."""
     max_distance: float = 3.0
     """1: largest distance of the contact point from first touch, in radii of the patch. Farther
@@ -102,7 +102,6 @@ def osculate(
 
 
 def _start_normal(insert: RayCaster, start: Array) -> Array:
-    """Return the normal of the insert's triangle under a point."""
     above = start + np.array([0.0, 1e-3, 0.0])
     _, face = insert.first(above[None], np.array([0.0, -1.0, 0.0]))
     up = np.array([0.0, 1.0, 0.0])

@@ -73,16 +73,16 @@ class EdgeSettings:
     """m: spacing of the vertical rays that find the edge. Larger: faster, but the error of the
     distance from the edge is up to half of this spacing."""
     steepest: float = 50.0 * DEGREE
-    """rad: slope above which a surface near the outline belongs to the rim. Chosen because no
+    """rad: slope above which a surface near the outline belongs to the rim. No
     loaded part of a dish is as steep."""
     rim: float = 4.0 * MILLIMETRE
-    """m: largest width of the rim. Chosen because a steep surface farther inside is a flank of the
+    """m: largest width of the rim. A steep surface farther inside is a flank of the
     eminence or of a post."""
     reach: float = 2.5 * MILLIMETRE
-    """m: distance from the edge below which a contact is flagged. Chosen: the radius of a usual
+    """m: distance from the edge below which a contact is flagged. The radius of a usual
     insert's rounded rim (1 to 2 mm) plus half the spacing of a map."""
     share: float = 0.05
-    """1: share of the peak pressure above which a point counts as loaded. Chosen because a smaller
+    """1: share of the peak pressure above which a point counts as loaded. A smaller
     pressure at the edge does no harm."""
 
 
@@ -183,13 +183,13 @@ def edge_of_insert_flags(
         yield (f"the {side} {AT_EDGE} (within {settings.reach / MILLIMETRE:g} mm); {where}")
 
 
-# 1: distance from a loaded point, in cells of the map, below which a defect is reached. Chosen: a
+# 1: distance from a loaded point, in cells of the map, below which a defect is reached. A
 # cell and its diagonal.
 REACH_CELLS = 1.5
-# 1: share of a body's vertices in the contact that are noisy, from which it is flagged. Chosen
-# because a crease beside a contact makes fewer of them rough.
+# 1: share of a body's vertices in the contact that are noisy, from which it is flagged.
+# A crease beside a contact makes fewer of them rough.
 NOISY_SHARE = 0.5
-# m: height above the bottom up to which a column counts as standing on it. Chosen above the
+# m: height above the bottom up to which a column counts as standing on it. Above the
 # flatness of machined bottoms.
 BOTTOM = 0.1 * MILLIMETRE
 

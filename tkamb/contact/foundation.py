@@ -26,10 +26,10 @@ from tkamb.units import MILLIMETRE
 Law = Literal["nonlinear", "linear"]
 
 
-# m: smallest thickness of the layer; at the rim it replaces smaller values. Chosen because it
+# m: smallest thickness of the layer; at the rim it replaces smaller values. It
 # keeps pressure = modulus * penetration / thickness finite.
 LEAST_THICKNESS = 1e-6
-# m: difference of two approaches below which their reactions count as equal. Chosen because with a
+# m: difference of two approaches below which their reactions count as equal. With a
 # stiffness of about 1e8 N/m the reactions differ by 0.1 N.
 APPROACH_STEP = 1e-9
 # 1: cosine of the angle between column and femoral normal (84 deg) below which the column is not
@@ -37,10 +37,10 @@ APPROACH_STEP = 1e-9
 # . n) would be more than ten times the pressure's.
 LEAST_COSINE = 0.1
 # 1: a reaction below `REACHED_SHARE` * load - `REACHED_FORCE` cannot rise to the load within
-# `APPROACH_STEP`. Chosen because map points that come into contact within this step raise the
+# `APPROACH_STEP`. Map points that come into contact within this step raise the
 # reaction by less than 1 % of the load.
 REACHED_SHARE = 0.99
-# N: see `REACHED_SHARE`. Chosen: ten times the reaction's change within `APPROACH_STEP`.
+# N: see `REACHED_SHARE`. Ten times the reaction's change within `APPROACH_STEP`.
 REACHED_FORCE = 1.0
 
 
@@ -337,7 +337,6 @@ class FoundationProbe:
         return self._of(samples, meet(samples, self._state.pair.femoral, result.pose), result.pose)
 
     def _of(self, samples: SurfaceSamples, meeting: Meeting, pose: Array) -> ProbedContact:
-        """Return the contact of loaded columns."""
         if not len(meeting.gap):
             through = self._state.pair.passed_through(pose) is not None
             return ProbedContact({}, known=not through, tangent=True)
@@ -409,7 +408,6 @@ class FoundationProbe:
         return LoadedPoints(pressure, samples.area, medial, slope)
 
     def _columns(self, pose: Array) -> tuple[SurfaceSamples, Meeting]:
-        """Return the near columns, and where they meet the femoral surface."""
         if self._last is None or not np.array_equal(self._last[0], pose):
             self._last = pose.copy(), *self._around.at(pose)
         return self._last[1:]

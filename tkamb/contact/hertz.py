@@ -16,7 +16,7 @@ from tkamb.contact.samples import MAP_POINT, SampledContact, SurfaceSamples, gap
 from tkamb.geometry.frames import SIDES, Array, Index
 from tkamb.units import MILLIMETRE
 
-# 1: smallest ratio of the semi-axes. Chosen because a smaller ratio is a line contact, where
+# 1: smallest ratio of the semi-axes. A smaller ratio is a line contact, where
 # elliptic integrals lose their digits.
 SMALLEST_AXIS_RATIO = 1e-6
 
@@ -87,12 +87,12 @@ def _axis_ratio(curvature_ratio: float) -> float:
 
 
 # Number of sub-cells along the ellipse's short semi-axis. The pressure of a map point is the mean
-# over the sub-cells of its cell. Chosen because the mean is then exact to 1 %.
+# over the sub-cells of its cell. The mean is then exact to 1 %.
 SHORT_AXIS_SUB_CELLS = 10
-# 1: smallest share of the patch's force that must lie on the insert. Chosen because with less the
+# 1: smallest share of the patch's force that must lie on the insert. With less the
 # contact extends over the rim, and Hertz's solution does not hold.
 LEAST_SHARE_ON_INSERT = 0.95
-# 1: smallest ratio of the two relative curvatures. Chosen because a smaller ratio is a line
+# 1: smallest ratio of the two relative curvatures. A smaller ratio is a line
 # contact.
 SMALLEST_CURVATURE_RATIO = 1e-6
 

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from tkamb.contact.pair import ContactPair
-from tkamb.contact.pressing import Presses, press_by_search
+from tkamb.contact.pressing import press_by_search
 from tkamb.contact.result import (
     ContactResult,
     ContactStatus,
@@ -207,7 +207,7 @@ class Probe:
 
     exact: ClassVar[bool] = False
 
-    def __init__(self, model: Presses, state: Any, start: Guess | None = None) -> None:
+    def __init__(self, model: ContactModel, state: Any, start: Guess | None = None) -> None:
         self._model, self._state, self.start = model, state, start
 
     def at(self, pose: Array) -> ProbedContact:

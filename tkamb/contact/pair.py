@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 Bearing = Literal["fixed", "mobile"]
 
 MAX_UNLOADED_APPROACH = 0.5 * MILLIMETRE
-"""m: approach above which a contact without load is out of range. Chosen because a sphere of 20 mm
+"""m: approach above which a contact without load is out of range. A sphere of 20 mm
 touches between map points of 3 mm up to an approach of 0.06 mm."""
 
 

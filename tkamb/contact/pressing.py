@@ -6,16 +6,19 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from tkamb.contact.pair import ContactPair
-from tkamb.contact.result import ContactResult, ContactStatus, Guess, WarmStart
+from tkamb.contact.result import ContactResult, ContactStatus, Guess
 from tkamb.errors import InputError
 from tkamb.geometry.first_touch import Touch
 from tkamb.geometry.frames import Array, transform
 from tkamb.units import MILLIMETRE
+
+if TYPE_CHECKING:
+    from tkamb.contact.model import ContactModel
 
 
 @dataclass(frozen=True)
@@ -30,22 +33,22 @@ class PressSettings:
     first_approach: float = 5e-5
     """m: initial guess of the approach if the caller gives none."""
     max_approach: float = 0.02
-    """m: largest approach of a search. Chosen because no insert carries a load beyond it."""
+    """m: largest approach of a search. No insert carries a load beyond it."""
     least_bracket: float = 1e-16
-    """m: width of the bracket at which the search ends. Chosen because it is above the rounding of
+    """m: width of the bracket at which the search ends. It is above the rounding of
     an approach of 20 mm (3e-18 m)."""
     max_evaluations: int = 80
     """Largest number of evaluations of the reaction in one press. Bisection of `max_approach` to
     `least_bracket` needs 48."""
     flagged_thickness_share: float = 0.5
-    """1: ratio of approach to thickness from which a result is flagged. Chosen: half of the ratio
+    """1: ratio of approach to thickness from which a result is flagged. Half of the ratio
     at which the contact has failed."""
     rim_distance: float = 0.5 * MILLIMETRE
-    """m: near the rim the thickness is the largest one within this distance. Chosen because the
+    """m: near the rim the thickness is the largest one within this distance. The
     thickness at the rim itself is zero."""
     ray_start_depth: float = 1e-7
     """m: depth below the surface at which rays into the insert begin; it is also the smallest
-    thickness. Chosen because it is above the rounding of a mesh."""
+    thickness. It is above the rounding of a mesh."""
 
 
 PRESS = PressSettings()
@@ -56,27 +59,6 @@ COLUMNS = np.array([(x, 0.0, z) for x in (0, -1, 1) for z in (0, -1, 1)]) * PRES
 DOWN = np.array([0.0, -1.0, 0.0])
 
 Reaction = Callable[[float], float]
-
-
-class Evaluates(Protocol):
-    """The part of a contact model that the search needs."""
-
-    def evaluate(self, state: Any, pose: Array, guess: Guess | None = None) -> ContactResult:
-        """Return the contact at a pose."""
-
-
-class Presses(Evaluates, Protocol):
-    """The part of a contact model that a probe needs; its methods use and return warm starts."""
-
-    def evaluate_from(
-        self, state: Any, pose: Array, start: Guess | None = None
-    ) -> tuple[ContactResult, WarmStart]:
-        """Return the contact at a pose, and the warm start of the next one."""
-
-    def press_from(
-        self, state: Any, load: float, pose: Array, start: Guess | None = None
-    ) -> tuple[ContactResult, WarmStart]:
-        """Return the contact under a load (N), and the warm start of the next one."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +85,7 @@ def check_load(load: float) -> None:
 
 
 def press_by_search(
-    model: Evaluates,
+    model: "ContactModel",
     state: Any,
     load: float,
     pose: Array,
@@ -116,7 +98,6 @@ def press_by_search(
     Rotation, x and z of `pose` do not change; its y is not used.
 
     Args:
-        model: any contact model.
         state: state that the model's `prepare` returned.
         load: superior-inferior force, N.
         pose: (4, 4) pose_femoral_in_insert.
@@ -181,13 +162,12 @@ def _carried(result: ContactResult, search: LoadSearch, load: float) -> ContactR
 class _Evaluations:
     """Evaluations of a model at approaches; the last result is stored."""
 
-    def __init__(self, model: Evaluates, state: Any, pose: Array, guess: Guess | None) -> None:
+    def __init__(self, model: "ContactModel", state: Any, pose: Array, guess: Guess | None) -> None:
         self._model, self._state, self._pose, self._guess = model, state, pose, guess
         self._approach = math.nan
         self._last: ContactResult | None = None
 
     def at(self, approach: float) -> ContactResult:
-        """Return the result at an approach (m)."""
         if self._last is None or approach != self._approach:
             pose = self._state.pair.pose_at_approach(self._pose, approach)
             self._last = self._model.evaluate(self._state, pose, self._guess)
@@ -269,7 +249,7 @@ def _between(low: float, low_value: float, high: float, high_value: float) -> fl
     return trial if low < trial < high else middle
 
 
-def unloaded_result(model: Evaluates, state: Any, pose: Array) -> ContactResult:
+def unloaded_result(model: "ContactModel", state: Any, pose: Array) -> ContactResult:
     """Return the contact at first touch, without pressure and force."""
     touching = state.pair.pose_at_approach(pose, 0.0)
     gap = model.evaluate(state, touching).gap
@@ -283,7 +263,6 @@ def within_insert(state: Any, result: ContactResult, *more: str) -> ContactResul
     their ratio is at least `PRESS.flagged_thickness_share`. See `compression`.
 
     Args:
-        state: prepared contact.
         result: contact to be checked.
         more: flags to be added.
     """
@@ -307,7 +286,6 @@ def compression(pair: ContactPair, touch: Touch, result: ContactResult) -> tuple
     pressure detects a spike of the insert.
 
     Args:
-        pair: the two bodies.
         touch: first touch at the result's rotation, x and z.
         result: contact with a positive approach.
     """

@@ -17,7 +17,7 @@ from tkamb.errors import InputError, names_near
 from tkamb.named_classes import NamedClasses
 from tkamb.units import MILLIMETRE
 
-# m: largest accepted spacing. Chosen because a condyle's contact is 5 to 20 mm across, and a
+# m: largest accepted spacing. A condyle's contact is 5 to 20 mm across, and a
 # coarser map does not resolve it.
 COARSEST = 10.0 * MILLIMETRE
 # m: default spacing, as `contact.resolution_mm` of a scene.

@@ -21,14 +21,14 @@ from tkamb.contact.pair import ContactPair, ContactSurface, PreparedContact
 from tkamb.geometry.frames import Array, Mask
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
-# Pa: peak pressure above which a result is flagged. Chosen because measured stress-strain curves
+# Pa: peak pressure above which a result is flagged. Measured stress-strain curves
 # of polyethylene end at 40 to 60 MPa, and the largest von Mises stress of a Hertz contact is about
 # 0.6 of its peak pressure.
 MAX_MEASURED_PRESSURE = 100.0 * MEGAPASCAL
 # 1: a patch that carries a smaller share of the force does not count as contact of a second
-# condyle. Chosen because such a patch is a fragment of the first condyle's contact.
+# condyle. Such a patch is a fragment of the first condyle's contact.
 LEAST_PATCH_SHARE = 0.05
-# m: smallest distance between the centres of two condyles' patches. Chosen because condyles of a
+# m: smallest distance between the centres of two condyles' patches. Condyles of a
 # knee are 40 to 50 mm apart.
 LEAST_PATCH_DISTANCE = 15.0 * MILLIMETRE
 

@@ -26,20 +26,20 @@ class MapPointSettings:
     share."""
     least_normal_y: float = 0.1
     """1: smallest superior component of a normal by which a covered area is divided; a slope of 84
-    deg. Chosen because it prevents a division by zero."""
+    deg. It prevents a division by zero."""
     side_start_normal_y: float = 0.5
     """1: superior component of a normal (a slope of 60 deg) below which the ray of a point, which
-    starts half-way through the insert, may start in the femur beside the point. Chosen because on
+    starts half-way through the insert, may start in the femur beside the point. On
     flatter surfaces the ray starts below the point."""
     ray_start_depth: float = 1e-6
-    """m: depth below the surface at which rays into the insert begin. Chosen because it is above
+    """m: depth below the surface at which rays into the insert begin. It is above
     the rounding of a mesh."""
     max_map_cells: int = 4_000_000
     """Largest number of map cells over the bounding box: a knee's map with a spacing of about
     0.03 mm."""
     max_inner_walls: int = 8
-    """Largest number of inner walls behind which a ray along the normal is continued. Chosen
-    because inserts of several bodies have fewer."""
+    """Largest number of inner walls behind which a ray along the normal is continued.
+    Inserts of several bodies have fewer."""
 
 
 MAP_POINT = MapPointSettings()

@@ -51,13 +51,13 @@ class AdjustmentSettings:
     the press both exceed the adjustment (Sharma 2008). "either": one of them does."""
     input_change: float = 0.1 * MILLIMETRE
     """m: error of a recorded gap. A frame is flagged if this error decides whether the recorded
-    rotation is changed. Chosen: a fifth of the error of fluoroscopy."""
+    rotation is changed. A fifth of the error of fluoroscopy."""
     largest_recorded_gap: float = 3.0 * MILLIMETRE
-    """m: if both condyles are farther from the insert, the pose is refused. Chosen because it is
+    """m: if both condyles are farther from the insert, the pose is refused. It is
     more than the errors of fluoroscopy."""
     level_difference: float = 5e-6
-    """m: difference of the condyles' gaps below which the femur is not turned. Chosen because
-    meshes do not resolve smaller differences."""
+    """m: difference of the condyles' gaps below which the femur is not turned.
+    Meshes do not resolve smaller differences."""
     touch_difference: float = 1e-7
     """m: difference of the condyles' travel to touch below which both touch together.
     Not studied."""
@@ -110,7 +110,6 @@ def adjust(
     """Return the adjusted pose.
 
     Args:
-        query: closest points of the pair.
         recorded: (4, 4) recorded pose_femoral_in_insert.
         settings: limits of the adjustment.
 

@@ -15,15 +15,15 @@ from tkamb.geometry.nearest import NearestPoints, sampled
 from tkamb.geometry.surface import Surface
 from tkamb.units import MILLIMETRE
 
-# m: edge of a cell. Chosen: about the edge of a mesh's triangles.
+# m: edge of a cell. About the edge of a mesh's triangles.
 CELL_EDGE = 1e-3
-# Largest number of cells along an edge of the grid; a larger surface gets larger cells. Chosen
-# because it limits memory.
+# Largest number of cells along an edge of the grid; a larger surface gets larger cells.
+# It limits memory.
 MOST_CELLS = 400
-# Number of cells along x or z. Triangles that span more are processed one by one. Chosen because
-# such triangles are few.
+# Number of cells along x or z. Triangles that span more are processed one by one.
+# Such triangles are few.
 WIDE_TRIANGLE_CELLS = 4
-# 1: largest slope of a plane that bounds the height. Chosen because the bound of a steeper plane
+# 1: largest slope of a plane that bounds the height. The bound of a steeper plane
 # is loose.
 LARGEST_SLOPE = 3.0
 
@@ -103,23 +103,23 @@ class ClosestPointSettings:
     """The search for the closest points of two surfaces."""
 
     region_radius: float = 1.6e-2
-    """m: largest distance of a point of the close region from the closest point. Chosen because a
+    """m: largest distance of a point of the close region from the closest point. A
     condyle's contact is smaller."""
     facing_cosine: float = 0.7
-    """1: cosine of the angle between the surfaces above which they face each other. Chosen because
-    surfaces at more than 45 deg do not touch face to face."""
+    """1: cosine of the angle between the surfaces above which they face each other.
+    Surfaces at more than 45 deg do not touch face to face."""
     clearance: float = 1e-6
     """m: a point that lies higher than this above the bound of the insert's height is outside the
-    insert. Chosen because it is above the rounding of a mesh."""
+    insert. It is above the rounding of a mesh."""
     gap_range: float = 10 * CONDYLE.facet_depth
-    """m: largest excess of a sample's gap over the smallest gap. Chosen because the weight of a
+    """m: largest excess of a sample's gap over the smallest gap. The weight of a
     farther sample is below 5e-5."""
     rounds: int = 3
     """Number of times that the triangles around the deepest point are divided into four. Larger:
     slower, but a finer position of the point."""
     kept_candidates: int = 8
-    """Number of vertices or triangles with which the search of the deepest point continues. Chosen
-    because the deepest point is among them."""
+    """Number of vertices or triangles with which the search of the deepest point continues.
+    The deepest point is among them."""
     batch_size: int = 64
     """Number of vertices whose depth is computed together, and largest number of intersecting
     triangles that are examined."""
@@ -311,7 +311,6 @@ class _Condyle:
         return fcl.CollisionObject(self.tree, place)
 
     def around(self, vertices: Index) -> Index:
-        """Return the triangles that touch the vertices."""
         corners = [self._by_vertex[self._edges[v] : self._edges[v + 1]] for v in vertices.tolist()]
         return self.faces[np.unique(np.concatenate(corners) // 3)]
 

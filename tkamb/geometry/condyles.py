@@ -17,32 +17,32 @@ class CondyleSettings:
     """The search for the two condyles of a femoral component."""
 
     notch_depth: float = 2e-3
-    """m: a component with a shallower notch along z has one condyle. Chosen because real components
+    """m: a component with a shallower notch along z has one condyle. Real components
     with two condyles have notches of 6 to 14 mm."""
     yawed_notch_depth: float = 3e-3
-    """m: smallest depth of a notch along any direction that shows two condyles. Chosen because a
+    """m: smallest depth of a notch along any direction that shows two condyles. A
     single condyle of a real component has notches up to 2.4 mm (components of the Grand Challenge
     subjects DM and JW, and of the shipped knee, cut in halves)."""
     extended_notch_depth: float = 0.5e-3
-    """m: smallest depth, at 0 deg of flexion, of the notch between two condyles. Chosen because a
+    """m: smallest depth, at 0 deg of flexion, of the notch between two condyles. A
     single long body has no notch there, although its ends may resemble condyles in flexion."""
     facet_depth: float = 3e-5
     """m: largest distance between a facet of 1 to 2 mm and the curved condyle that it approximates.
     Heights that differ by less count as equal."""
     strip_width: float = 1e-3
-    """m: width of the strips along z in which the notch is searched. Chosen because a condyle is
+    """m: width of the strips along z in which the notch is searched. A condyle is
     wider."""
     sample_spacing: float = 1e-3
-    """m: spacing of the samples of a condyle's surface. Chosen: about the size of a mesh's
+    """m: spacing of the samples of a condyle's surface. About the size of a mesh's
     facets."""
     highest_sample: float = 10 * facet_depth
-    """m: height above the lowest vertex above which samples have no weight. Chosen because higher
+    """m: height above the lowest vertex above which samples have no weight. Higher
     samples are not in contact."""
     samples_per_box: int = 32
     """Number of samples of a surface in one box of the search. Chosen for speed; results do not
     depend on it."""
     deepest_notch: float = 15e-3
-    """m: upper limit of heights above the lowest point. Chosen because notches are 6 to 14 mm
+    """m: upper limit of heights above the lowest point. Notches are 6 to 14 mm
     deep."""
 
 
@@ -54,17 +54,17 @@ CONDYLE = CondyleSettings()
 # bodies.
 LEAST_INNER_SHARE = 0.33
 # 1: smallest magnitude of the sum of the inner surface's area vectors, as a share of its area. A
-# smaller sum shows no opening. Chosen below the 0.38 to 0.52 of nine femoral components; two
+# smaller sum shows no opening. Below the 0.38 to 0.52 of nine femoral components; two
 # spheres side by side have 0.
 LEAST_OPENING_SHARE = 0.3
 # rad: angle of the opening's direction from superior towards posterior. Measured: 11 to 30 deg in
 # nine femoral components.
 OPENING_LEAN = 20.0 * DEGREE
 # 1: half the width of the strip between the condyles in which the flange is searched, as a share
-# of the component's width. Chosen because it is narrower than the notch.
+# of the component's width. It is narrower than the notch.
 FLANGE_WIDTH_SHARE = 0.1
 # 1: smallest position of the flange along the component, as a share of the length from behind.
-# Chosen below the 0.87 to 0.94 of nine femoral components.
+# Below the 0.87 to 0.94 of nine femoral components.
 FLANGE_POSITION = 0.75
 # rad: if the opening's direction is farther from the sagittal plane, the axes are wrong. Measured:
 # at most 2 deg in nine femoral components.
@@ -145,7 +145,6 @@ def condyle_yaw(femoral: Surface, search: YawSearch = YAW_SEARCH) -> tuple[float
 
     Args:
         femoral: femoral component, femoral frame.
-        search: settings of the search.
 
     Returns:
         Angle about +y, rad, in (-90, 90] deg, and depth of the deepest notch, m. Without a notch
@@ -349,7 +348,6 @@ class _SampledCondyle:
 
     @classmethod
     def of(cls, condyle: Surface) -> "_SampledCondyle":
-        """Return the samples of a condyle's surface."""
         samples, _, areas = sampled(condyle, CONDYLE.sample_spacing)
         begin = np.arange(0, len(samples), CONDYLE.samples_per_box)
         low = np.minimum.reduceat(samples, begin)

@@ -25,9 +25,9 @@ Kind = Literal["opening", "spike", "noise", "steps"]
 # Number of nearest vertices for a quadric: three times its six coefficients.
 NEIGHBOURS = 18
 # m: smallest height of a spike whose triangles have all their vertices among the nearest ones.
-# Chosen above the largest difference of 0.03 mm on the dishes of three inserts.
+# Above the largest difference of 0.03 mm on the dishes of three inserts.
 SPIKE = 0.05 * MILLIMETRE
-# m: smallest height of another spike. Chosen above the largest difference of 0.12 mm on the dishes
+# m: smallest height of another spike. Above the largest difference of 0.12 mm on the dishes
 # of the same inserts; the nearest vertices then lie on one side.
 SPIKE_OF_FAN = 0.2 * MILLIMETRE
 # Smallest number of nearest vertices that share a triangle with a spike. By definition of a tip on
@@ -35,18 +35,18 @@ SPIKE_OF_FAN = 0.2 * MILLIMETRE
 LEAST_RING = 3
 # 1: smallest ratio of a spike's height to the roughness around it. Not studied.
 SPIKE_RATIO = 6.0
-# m: roughness of a noisy surface. Chosen: a tenth of the approach of a knee's contact.
+# m: roughness of a noisy surface. A tenth of the approach of a knee's contact.
 NOISE = 0.01 * MILLIMETRE
 # Number of directions of the facets that marching cubes make of voxels.
 DIRECTIONS = 26
-# 1: smallest share of the area in that number of directions, on a surface of voxels. Chosen: a
+# 1: smallest share of the area in that number of directions, on a surface of voxels. A
 # smooth surface of an implant has less than half in so few.
 DIRECTION_SHARE = 0.9
-# Smallest number of equidistant levels of a surface of voxels. Chosen because a component with
+# Smallest number of equidistant levels of a surface of voxels. A component with
 # flat cuts has fewer.
 LEVELS = 6
 # 1: smallest cosine between the normals of noisy neighbours and their mean; a smaller one is a
-# crease. Chosen: the edge of a component turns by more than twice this angle.
+# crease. The edge of a component turns by more than twice this angle.
 LEAST_COSINE = 0.8
 # 1: smallest eigenvalue of the normal equations, at neighbours within the unit disc. With a
 # smaller one the quadric is not determined. Not studied.
@@ -54,7 +54,7 @@ LEAST_EIGENVALUE = 1e-3
 # 1: mean cosine between a surface beside a loop and the way to the loop's centre, above which the
 # surface lies within the loop. By definition 0 for a tube. Not studied otherwise.
 SHEET = 0.3
-# m: spacing of the points that fill an opening. Chosen below the cells of a map.
+# m: spacing of the points that fill an opening. Below the cells of a map.
 CAP_SPACING = 0.5 * MILLIMETRE
 
 

@@ -12,19 +12,19 @@ from tkamb.geometry.frames import Array, Index, Mask, pose
 from tkamb.geometry.repair import facing_material
 from tkamb.geometry.surface import Surface
 
-# m: largest distance of a flat's corners from its plane. Chosen because the noise of a mesh is
+# m: largest distance of a flat's corners from its plane. The noise of a mesh is
 # smaller.
 FLATNESS = 5e-5
-# 1: smallest area of a flat that may be the bottom, as a share of the largest flat's area. Chosen
-# because a smaller flat is a recess.
+# 1: smallest area of a flat that may be the bottom, as a share of the largest flat's area.
+# A smaller flat is a recess.
 COMPARABLE_SHARE = 0.5
 # 1: of two flats that face down, the larger one is the bottom if the smaller one has less than
 # this share of the larger one's area. If the areas are closer, the mesh is refused.
 CLEAR_SHARE = 0.9
-# m: noise of the bottom above which a notice is printed. Chosen because a mesh in single precision
+# m: noise of the bottom above which a notice is printed. A mesh in single precision
 # rounds by less.
 UNEVEN_NOISE = 1e-6
-# rad: a smaller tilt is not corrected. Chosen because it moves the ends of the insert by less than
+# rad: a smaller tilt is not corrected. It moves the ends of the insert by less than
 # rounding.
 LEVEL_TILT = 1e-6
 
@@ -33,8 +33,8 @@ TILT_LIMIT = math.radians(30.0)
 """rad: a bottom tilted by less than this from -y is turned level."""
 
 
-# 1: a flat is an inner wall if material lies in front of more than this share of its area. Chosen:
-# the majority of the area.
+# 1: a flat is an inner wall if material lies in front of more than this share of its area.
+# The majority of the area.
 INNER_SHARE = 0.5
 
 

@@ -25,13 +25,13 @@ from tkamb.geometry.topology import counted
 from tkamb.geometry.winding import PlanGrid
 
 # 1: largest share of lines with an odd number of crossings. These lines are repaired; with a
-# larger share the mesh is refused. Chosen because small defects of a mesh affect fewer lines.
+# larger share the mesh is refused. Small defects of a mesh affect fewer lines.
 ODD_SHARE = 0.01
-# m: crossings nearer to each other belong to duplicate faces. Chosen because it is above rounding.
+# m: crossings nearer to each other belong to duplicate faces. It is above rounding.
 SAME_HEIGHT = 1e-12
 
 
-# m: distance below which bodies touch. Chosen: ten times the rounding of single precision.
+# m: distance below which bodies touch. Ten times the rounding of single precision.
 TOUCHING_DISTANCE = 1e-7
 
 

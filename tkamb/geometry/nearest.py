@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 # Largest number of triangles in a leaf. Chosen for speed; results do not depend on it.
 TRIANGLES_PER_LEAF = 4
-# 1: distance by which boxes are enlarged, as a share of the surface's size. Chosen because it is
+# 1: distance by which boxes are enlarged, as a share of the surface's size. It is
 # above rounding.
 MARGIN = 1e-7
 
@@ -162,7 +162,7 @@ def _part(centres: Array, order: Index, axis: int, first: int, last: int, middle
             return
 
 
-# Largest number of samples of a surface. Chosen because it limits memory and time.
+# Largest number of samples of a surface. It limits memory and time.
 MAX_SAMPLES = 150_000
 
 
@@ -204,7 +204,6 @@ class NearestPoints:
     """Exact search for the nearest points of one surface.
 
     Args:
-        surface: the surface.
         tree: tree of the surface; None: it is built.
     """
 

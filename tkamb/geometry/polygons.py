@@ -109,11 +109,11 @@ def _points_below(segments: Array, y: float) -> Array:
     return np.concatenate([ends[ends[:, 1] <= y], crossings])
 
 
-# 1: a signed area below this share of the polygon's area is zero. Chosen because it is above
+# 1: a signed area below this share of the polygon's area is zero. It is above
 # rounding.
 AREA_ROUNDING = 1e-12
 # 1: smallest ratio of a polygon's enclosed area to the total area of its triangles. With a smaller
-# ratio the polygon crosses itself. Chosen because it is above rounding.
+# ratio the polygon crosses itself. It is above rounding.
 LEAST_AREA_SHARE = 1e-9
 
 

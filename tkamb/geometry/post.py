@@ -19,34 +19,34 @@ from tkamb.geometry.surface import Surface
 from tkamb.geometry.topology import connected_parts
 from tkamb.units import MILLIMETRE
 
-# m: smallest distance of the plane from a vertex. Chosen because it is above rounding.
+# m: smallest distance of the plane from a vertex. It is above rounding.
 VERTEX_CLEARANCE = 1e-9
 # m: step by which the plane is moved until its distance from all vertices is at least
 # `VERTEX_CLEARANCE`. Not studied.
 PLANE_SHIFT = 1e-7
 
 
-# m: spacing of the lines along y that measure the insert's height. Chosen because a post is
+# m: spacing of the lines along y that measure the insert's height. A post is
 # several times as wide.
 LINE_SPACING = 1e-3
-# m: smallest rise of a post above the lowest dish. Chosen because flanks and lips of dishes are
+# m: smallest rise of a post above the lowest dish. Flanks and lips of dishes are
 # lower.
 LEAST_RISE = 8e-3
-# m: smallest drop of a steep side of a post within two lines. Chosen because this slope of 56 deg
+# m: smallest drop of a steep side of a post within two lines. This slope of 56 deg
 # is steeper than a dish.
 SIDE_DROP = 3e-3
-# 1: smallest share of a post's outline with a drop of `SIDE_DROP`. Chosen because a post may merge
+# 1: smallest share of a post's outline with a drop of `SIDE_DROP`. A post may merge
 # into the insert along the rest.
 STEEP_SHARE = 0.75
 # 1: largest distance of a post's centre from the middle, as a share of half the insert's width.
-# Chosen because dishes lie farther out.
+# Dishes lie farther out.
 MIDDLE_SHARE = 0.25
-# m: height above the surroundings at which the post is cut off. Chosen because it is above the
+# m: height above the surroundings at which the post is cut off. It is above the
 # noise of a mesh.
 FOOT_CLEARANCE = 0.25e-3
 # 1: height above the foot at which the post's front is measured, as a share of its height.
 BACK_SHARE = 0.75
-# m: smallest thickness of a post. Chosen because a thinner post cannot carry the force of a cam.
+# m: smallest thickness of a post. A thinner post cannot carry the force of a cam.
 LEAST_THICKNESS = 2e-3
 
 
@@ -162,12 +162,8 @@ def _steep_share(top: Array, patch: Mask) -> float:
     """Return the share of the lines around a patch that end at least `side_drop` below the edge."""
     near = binary_dilation(patch)
     around = binary_dilation(near, iterations=1) & ~near
-    edge = float(np.median(top[patch & ~_eroded(patch)]))
+    edge = float(np.median(top[patch & binary_dilation(~patch)]))
     return float(np.mean(top[around] < edge - SIDE_DROP)) if around.any() else 0.0
-
-
-def _eroded(patch: Mask) -> Mask:
-    return ~binary_dilation(~patch)
 
 
 def split_faces(

@@ -15,16 +15,16 @@ if TYPE_CHECKING:
     from tkamb.geometry.surface import Surface
 
 
-# 1: largest distance of a crossing outside a triangle, in barycentric coordinates. Chosen because
-# it is above rounding.
+# 1: largest distance of a crossing outside a triangle, in barycentric coordinates.
+# It is above rounding.
 EDGE_TOLERANCE = 1e-9
 # 1: distance below which two crossings of a ray are one crossing, as a share of half the diagonal
-# of the bounding box. Chosen because it is above rounding.
+# of the bounding box. It is above rounding.
 SAME_CROSSING = 1e-10
-# Number of crossings per ray for which memory is allocated at first. Chosen because most rays have
+# Number of crossings per ray for which memory is allocated at first. Most rays have
 # fewer.
 USUAL_CROSSINGS = 4
-# Number of rays from which two threads share the work. Chosen because with fewer rays the second
+# Number of rays from which two threads share the work. With fewer rays the second
 # thread costs more time than it saves.
 THREADED_RAYS = 500
 
@@ -38,7 +38,7 @@ DEEPEST = 64
 NO_TRIANGLE = -1
 
 
-# m: distance below which two shells touch. Chosen because it is above the rounding of a mesh.
+# m: distance below which two shells touch. It is above the rounding of a mesh.
 TOUCHING_DISTANCE = 1e-6
 
 

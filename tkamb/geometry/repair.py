@@ -31,10 +31,10 @@ from tkamb.geometry.topology import (
     signed_volumes,
 )
 
-# m: distance below which vertices of open edges are merged. Chosen below the facets of a mesh and
+# m: distance below which vertices of open edges are merged. Below the facets of a mesh and
 # above the rounding of its file.
 WELD_DISTANCE = 5e-5
-# m: largest width of a hole that is closed by a fan of triangles. Chosen: about one lattice cell.
+# m: largest width of a hole that is closed by a fan of triangles. About one lattice cell.
 GAP_WIDTH = 2e-3
 # m: largest width of a hole of three edges that is closed. It may be wider than other holes,
 # because it is one missing triangle.
@@ -281,13 +281,13 @@ def _forks(faces: Index) -> Index:
     return np.unique(half_edges(faces)[odd[edge]])
 
 
-# m: distance in front of a triangle at which material is searched. Chosen because bodies with a
+# m: distance in front of a triangle at which material is searched. Bodies with a
 # wider gap are separate.
 PROBE_DISTANCE = 2e-5
-# m: distance below which a vertex lies on an open edge. Chosen because it is above the rounding of
+# m: distance below which a vertex lies on an open edge. It is above the rounding of
 # a mesh.
 EDGE_DISTANCE = 1e-6
-# m²: smallest area of a wall. Chosen because triangles in a narrow corner have less area.
+# m²: smallest area of a wall. Triangles in a narrow corner have less area.
 LEAST_AREA = 2e-6
 
 

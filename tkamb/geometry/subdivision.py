@@ -14,12 +14,12 @@ from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.topology import Ragged, edge_use
 
 # 1: largest distance of a vertex from the middle of a coarser edge, as a share of the surface's
-# size. Chosen because files round coordinates by less.
+# size. Files round coordinates by less.
 HALVING_TOLERANCE = 1e-6
-# Largest number of subdivisions that are undone. Chosen because 8 subdivisions make 65,536
+# Largest number of subdivisions that are undone. 8 subdivisions make 65,536
 # triangles of one.
 MOST_LEVELS = 8
-# Largest number of connected parts; a surface of more parts stays unchanged. Chosen because no
+# Largest number of connected parts; a surface of more parts stays unchanged. No
 # implant has as many.
 MOST_PARTS = 100
 

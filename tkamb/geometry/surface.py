@@ -25,7 +25,7 @@ NO_CREASE = float(np.pi)
 """rad: crease angle with which all triangles at a vertex count."""
 
 
-# 1: difference below which two cosines are equal. Chosen because it is above rounding.
+# 1: difference below which two cosines are equal. It is above rounding.
 COSINE_ROUNDING = 1e-9
 
 
@@ -33,7 +33,7 @@ SMOOTH_WITHIN = np.radians(30.0)
 """rad: angle between normals above which triangles belong to different smooth surfaces."""
 
 NO_TURN = 1e-3
-"""rad: angle between facets below which they are coplanar. Chosen above the rounding of a file."""
+"""rad: angle between facets below which they are coplanar. Above the rounding of a file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,6 @@ class Surface:
     Args:
         vertices: (n, 3) m.
         faces: (k, 3) vertices of the triangles.
-        name: name in messages.
         merged: True if no two vertices are at the same place.
     """
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 # Largest number of buckets of the plan view. Larger: more memory. Not studied.
 MAX_BUCKETS = 1_000_000
-# Number of bits of the largest integer position. Chosen because products of differences fit into
+# Number of bits of the largest integer position. Products of differences fit into
 # 63 bits.
 PLAN_BITS = 29
 

@@ -47,7 +47,6 @@ def given_material(table: Mapping[str, Any], where: object = "[material]") -> Ma
 
     Args:
         table: keys of docs/materials.md; a key with value None is ignored.
-        where: name of the file or table, for messages.
 
     Raises:
         InputError: a key is unknown, missing or superfluous, or a value is out of range.

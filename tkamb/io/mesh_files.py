@@ -28,7 +28,6 @@ class LatticeReport:
 
     Args:
         lattice: the lattice in the insert frame.
-        quality: measures of its quality.
         out: path of the .vtu file; None: no file is written.
         side: side of the knee; the lattice of a left insert is mirrored.
     """

@@ -104,20 +104,12 @@ class Preset:
     needs: ClassVar[Mapping[str, str]] = {}
 
     def lacks(self, content: Mapping[str, Any]) -> str | None:
-        """Return words on what the study needs and the scene lacks, apart from `needs`, or None.
-
-        Args:
-            content: content of the scene's file.
-        """
+        """Return words on what the study needs and the scene lacks, apart from `needs`, or None."""
         del content
         return None
 
     def departures(self, content: Mapping[str, Any]) -> tuple[str, ...]:
-        """Return words on each remaining difference between a scene and the study.
-
-        Args:
-            content: content of the scene's file.
-        """
+        """Return words on each remaining difference between a scene and the study."""
         del content
         return ()
 
@@ -127,9 +119,7 @@ class Preset:
         """Apply the preset to a scene's content, in place.
 
         Args:
-            content: content of the scene's file.
             overrides: dotted key -> value that replaces the preset's value later.
-            where: name of the scene in messages.
 
         Raises:
             InputError: the scene lacks data that the study needs.

@@ -50,7 +50,6 @@ def read_toml(path: str | Path, *, what: str) -> dict[str, Any]:
     """Return the content of a TOML file.
 
     Args:
-        path: the file.
         what: name of the kind of file in messages.
 
     Raises:
@@ -64,7 +63,6 @@ def parse_toml(text: str, where: object) -> dict[str, Any]:
 
     Args:
         text: the TOML text.
-        where: file or option, for messages.
 
     Raises:
         InputError: the text is not TOML, or exceeds `TomlLimits`.
@@ -102,7 +100,6 @@ def toml_value(value: Any, decimals: int | None = None) -> str:
     """Return a text, path, number, list, array or inline table as TOML.
 
     Args:
-        value: the value.
         decimals: number of decimals of floating-point numbers; None: all that they need.
     """
     if hasattr(value, "tolist"):  # an array or number of NumPy, which is not imported here:

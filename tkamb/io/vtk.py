@@ -80,10 +80,6 @@ def write_map_series(maps: "ContactMaps", folder: Path) -> list[str]:
 
     A failed frame has no map (NaN) and gets no file.
 
-    Args:
-        maps: the maps of the run.
-        folder: folder of the files.
-
     Returns:
         The names of the files, the .pvd first.
 

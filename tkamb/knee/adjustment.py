@@ -32,15 +32,15 @@ from tkamb.contact.result import ContactResult, ContactStatus, Guess, WarmStart
 from tkamb.geometry.adjustment import Adjustment, RestoreRule, moved_to_touch, touches
 from tkamb.geometry.closest import ClosestPointQuery
 from tkamb.geometry.frames import KNEE_COORDINATES, knee_axes, knee_coordinates, knee_pose
-from tkamb.knee.contact_points import CondylePoint
 from tkamb.knee.equations import SolvedLoads
+from tkamb.knee.unknowns import CondylePoint
 from tkamb.units import DEGREE, MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.contact.model import Probe
 
 
-# rad: step of the finite difference. Chosen because it shifts about 60 N between the condyles,
+# rad: step of the finite difference. It shifts about 60 N between the condyles,
 # thirty times the lattice's tolerance, but unloads no condyle (0.2 deg or more would).
 ADDUCTION_STEP = 0.02 * DEGREE
 
@@ -59,7 +59,6 @@ def split_sensitivity(
     fails.
 
     Args:
-        probe: probe of the contact model.
         result: the contact before the change of adduction; its load is the force along -y.
         start: warm start that was returned with this contact; None: made from the contact.
     """
@@ -105,8 +104,8 @@ def _medial(result: ContactResult) -> float:
     return result.medial.force if result.medial else 0.0
 
 
-# m: displacement of a contact point above which the text says "jumps" and not "moves". Chosen
-# because a contact point on one dish moves by less from frame to frame.
+# m: displacement of a contact point above which the text says "jumps" and not "moves".
+# A contact point on one dish moves by less from frame to frame.
 JUMP_DISTANCE = 5.0 * MILLIMETRE
 
 
@@ -189,7 +188,6 @@ def press_adjusted(
     """Press the adjusted femur in, check the adjustment, and undo its rotation if required.
 
     Args:
-        model: any contact model.
         state: state that the model's `prepare` returned.
         load: superior-inferior force, N.
         adjustment: adjustment of the recorded pose, from `tkamb.geometry.adjustment.adjust`.
@@ -218,7 +216,6 @@ def press_adjusted(
 
 
 def _flagged(result: ContactResult, adjustment: Adjustment) -> ContactResult:
-    """Return the contact with the flags of the adjustment appended."""
     if not adjustment.flags:
         return result
     return replace(result, flags=(*result.flags, *adjustment.flags))

@@ -201,7 +201,6 @@ def _offers(model: pin.Model, part: str) -> bool:
 
 
 def _missing(model: pin.Model, part: str) -> InputError:
-    """Return the error for a part that the model must have."""
     names = [frame.name for frame in model.frames]
     hint = f"name it: frames={{'{part}': ...}}; {names_near(part, names)}"
     what = f"no frame '{part}' in the model"
@@ -235,7 +234,6 @@ def _joint_placement(model: pin.Model, name: str, base: FixedFrame) -> FixedFram
 
 
 def _ancestors(model: pin.Model, joint: int) -> list[int]:
-    """Return a joint and its parents, up to the universe."""
     joints = [joint]
     while joints[-1]:
         joints.append(int(model.parents[joints[-1]]))
@@ -243,7 +241,6 @@ def _ancestors(model: pin.Model, joint: int) -> list[int]:
 
 
 def _path(model: pin.Model, one: int, other: int) -> tuple[int, ...]:
-    """Return the joints that lie between two bodies, ascending."""
     first, second = set(_ancestors(model, one)), set(_ancestors(model, other))
     return tuple(sorted(first ^ second))
 
@@ -282,12 +279,11 @@ def _shank(
 
 
 def _hip(femur: FixedFrame, path: tuple[int, ...]) -> FixedFrame:
-    """Return the frame of the femur's parent joint, or the femur's frame if it is a knee joint."""
     return femur if femur.joint in path else FixedFrame(femur.joint, pin.SE3.Identity())
 
 
 # m: a thigh whose centre of mass lies farther below the femoral component, with a shank whose
-# centre of mass lies farther above the insert, are exchanged. Chosen because the centres of mass
+# centre of mass lies farther above the insert, are exchanged. The centres of mass
 # of thigh and shank lie 0.15 to 0.3 m from the knee.
 LEAST_LEVER = 0.05
 

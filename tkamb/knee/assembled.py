@@ -45,13 +45,13 @@ if TYPE_CHECKING:
     from tkamb.knee.patella import PatellaState
 
 
-# 1: largest error of a quaternion's norm. Chosen because an error of this size changes a force by
+# 1: largest error of a quaternion's norm. An error of this size changes a force by
 # a millionth.
 UNIT_TOLERANCE = 1e-6
-# m: largest distance of the components. Chosen because the ligaments of a knee tear at 20 mm of
+# m: largest distance of the components. The ligaments of a knee tear at 20 mm of
 # distraction.
 MAX_DISTANCE = 0.1
-# rad: largest angle of a joint of the knee; a larger one is probably in degrees. Chosen because no
+# rad: largest angle of a joint of the knee; a larger one is probably in degrees. No
 # joint of a knee makes a full turn.
 MAX_TURN = 2.0 * np.pi
 
@@ -425,7 +425,6 @@ class AssembledKnee:
         return solution
 
     def _link_poses(self, kinematics: KneePose, patella: "PatellaState | None") -> dict[str, Array]:
-        """Return link -> pose (4, 4) in the insert frame."""
         poses = {
             "femur": kinematics.pose,
             "tibia": inverse(self.chain.insert_in_tibia),

@@ -36,34 +36,34 @@ class BalanceSettings:
 
     force_tolerance: float = 0.05
     """N (moments are divided by the lever arm): residual below which a coordinate has converged. If
-    the noise of the forces is larger, the noise replaces this tolerance. Chosen because it is far
+    the noise of the forces is larger, the noise replaces this tolerance. It is far
     below the resolution of the reports."""
     step_tolerance: float = 2e-6
     """m: Newton step below which a coordinate has converged. Not studied."""
     least_stiffness: float = 100.0
-    """N/m: a state with a smaller stiffness is indeterminate. Chosen because such a state moves by
+    """N/m: a state with a smaller stiffness is indeterminate. Such a state moves by
     more than 10 mm per newton."""
     narrow_radius: float = 1e-6
-    """m: trust radius below which finite differences replace an approximate stiffness. Chosen
-    because an approximation that needs shorter steps does not reduce the residual."""
+    """m: trust radius below which finite differences replace an approximate stiffness.
+    An approximation that needs shorter steps does not reduce the residual."""
     jump_step: float = 1e-7
-    """m: a step below which a change of force that the stiffness does not explain is a jump. Chosen
-    because it moves a contact of 1e7 N/m by 1 N at most, which the stiffness explains."""
+    """m: a step below which a change of force that the stiffness does not explain is a jump.
+    It moves a contact of 1e7 N/m by 1 N at most, which the stiffness explains."""
     largest_jump: float = 1.0
-    """N: largest jump on which an equilibrium may lie. Chosen: 0.1 % of a usual load. Measured: at
+    """N: largest jump on which an equilibrium may lie. 0.1 % of a usual load. Measured: at
     2 mm 3 of 72 frames of subject JW had no equilibrium without it; the foundation's force jumped
     there by 0.2 to 0.6 N, where a column crosses an edge of two facets of the femur."""
     max_travel: float = 20e-3
     """m: largest distance of a coordinate from its initial guess; beyond it the search ends.
-    Chosen because a coordinate that moves as far has no stable equilibrium."""
+    A coordinate that moves as far has no stable equilibrium."""
     difference_step: float = 2e-6
-    """m: step of the finite differences of the force. Chosen equal to `step_tolerance`."""
+    """m: step of the finite differences of the force. Equal to `step_tolerance`."""
     max_prediction_error: float = 0.5
     """1: relative error of the predicted change of force. A larger error discards all corrections
-    of an approximate stiffness. Chosen because with a larger error a step does not reduce the
+    of an approximate stiffness. With a larger error a step does not reduce the
     residual reliably."""
     max_steps: int = 200
-    """Maximum number of steps. Chosen because a lightly loaded knee that slides 16 mm over lattice
+    """Maximum number of steps. A lightly loaded knee that slides 16 mm over lattice
     cells of 2 mm needs 80."""
 
 
@@ -110,9 +110,7 @@ class Balance:
         coordinates: last coordinates, shape (n,), m.
         force: residual, shape (n,), N.
         stiffness: stiffness at these coordinates, shape (n, n), N/m.
-        status: how the search ended.
         steps: number of accepted and rejected steps.
-        trials: number of evaluations of the forces.
         smallest_stiffness: smallest real part of the stiffness' eigenvalues, N/m.
         work: work of the forces along each accepted step, N·m.
         converged: True: converged to the tolerances. False: ended early by `residual_share` or
@@ -193,12 +191,12 @@ class _Search:
                 first.stiffness,
             )
             self._correction = np.zeros((len(start), len(start)))
-            self.stiffness = self._first_stiffness(first, stiffness)
+            known = stiffness if first.stiffness is None else first.stiffness
+            self.stiffness = self._differences() if known is None else known
         else:
             self.stiffness = np.full((len(start), len(start)), np.nan)
 
     def run(self) -> Balance:
-        """Run the search."""
         if not self.known:
             return self._end(BalanceStatus.OUT_OF_RANGE)
         while self._steps < BALANCE.max_steps:
@@ -297,11 +295,6 @@ class _Search:
     def _at(self, x: Array) -> Trial:
         self._trials += 1
         return self._forces(x)
-
-    def _first_stiffness(self, first: Trial, guess: Array | None) -> Array:
-        if first.stiffness is not None:
-            return first.stiffness
-        return self._differences() if guess is None else guess
 
     def _differences(self) -> Array:
         self._from_differences, self._steps_since_differences = True, 0

@@ -38,7 +38,7 @@ from tkamb.knee.load import LinkPoint, PointForces, wrenches
 if TYPE_CHECKING:
     from tkamb.knee.wrap_object import WrapObject
 
-# m and rad: pose error below which the iteration has converged. Chosen because it is near the
+# m and rad: pose error below which the iteration has converged. It is near the
 # rounding error of double precision.
 POSE_TOLERANCE = 1e-12
 # m and rad: largest pose error that is accepted after the last Newton step. Not studied.
@@ -65,7 +65,6 @@ class CanonicalChain(Chain):
     """The canonical chain of one knee, described at the top of this module.
 
     Args:
-        anatomy: the knee in the user's model.
         is_left: whether the knee is a left one.
         with_patella: whether the chain has a patella.
         component: axes of the femoral component, fixed to the femur's joint.
@@ -115,7 +114,6 @@ class CanonicalChain(Chain):
         return se3(mirrored_pose(pose) if self._left else pose)
 
     def _inertia(self, inertia: pin.Inertia, placement: pin.SE3) -> pin.Inertia:
-        """Return the inertia of a body in the axes of a frame on it."""
         inertia_in_frame = inertia.se3Action(placement.inverse())
         if not self._left:
             return inertia_in_frame
@@ -161,7 +159,6 @@ class Bridge:
     """Converts poses, motions and loads between the user's model and the canonical chain.
 
     Args:
-        anatomy: the knee in the user's model.
         is_left: whether the knee is a left one.
         chain: the canonical chain.
         component: axes of the femoral component, fixed to the femur's joint.
@@ -469,7 +466,6 @@ class Bridge:
 
         Args:
             data: Pinocchio data of the user's model, with joint placements up to date.
-            link: name of the link.
         """
         insert = data.oMi[self.insert.joint] * self.insert.placement
         return np.asarray(data.oMi[self.joint_of(link)].actInv(insert).toDualActionMatrix())

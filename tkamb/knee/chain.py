@@ -255,7 +255,6 @@ class ChainState:
         """Add a wrench (6,) to the wrench that all loads together must exert on a link.
 
         Args:
-            link: name of the link.
             wrench: force (N) and moment about the insert's origin (N·m), insert frame, shape (6,).
         """
         self.inertial = self.inertial + self._jacobian(link).T @ wrench

@@ -16,8 +16,8 @@ from tkamb.contact.pair import ContactPair
 from tkamb.contact.result import ContactStatus, Guess
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array, cross, displaced, pose
-from tkamb.knee.contact_points import CONTACT_POINT, CondylePoint
 from tkamb.knee.load import wrench_of
+from tkamb.knee.unknowns import CONTACT_POINT, CondylePoint
 
 
 @dataclass(frozen=True)
@@ -25,16 +25,16 @@ class DifferenceSettings:
     """Central differences, for the stiffness of a model without an exact tangent."""
 
     step: float = 4e-6
-    """m: step of a translation. Chosen because it is large against the solver's residual error, and
+    """m: step of a translation. It is large against the solver's residual error, and
     small against the radius of the contact."""
     exact_step: float = 1e-9
-    """m: step of a translation for a model without an iterative solver. Chosen because it is far
+    """m: step of a translation for a model without an iterative solver. It is far
     above rounding errors and far below the size of a facet."""
     arm: float = 0.025
-    """m: lever arm; the step of a rotation is the step of a translation over this arm. Chosen as
-    half the distance of the condyles."""
+    """m: lever arm; the step of a rotation is the step of a translation over this arm.
+    Half the distance of the condyles."""
     tolerance: float = 1e-6
-    """1: solver tolerance for these evaluations, if the model has a tolerance. Chosen because a
+    """1: solver tolerance for these evaluations, if the model has a tolerance. A
     finite difference divides the solver's error by the step."""
 
 
@@ -45,8 +45,6 @@ class KneeContact:
     """A contact model of one pair of bodies, with friction.
 
     Args:
-        model: the contact model.
-        pair: femoral component and insert.
         friction: Coulomb coefficient.
         state: state that the model's `prepare` returned for the pair; None: prepared at first use.
     """
@@ -121,7 +119,6 @@ class KneeContact:
             )
 
     def _why(self, femur_pose: Array) -> str:
-        """Return the reason why the model failed at a pose (4, 4)."""
         result = self.model.evaluate(self.state, femur_pose)
         reason = "; ".join(result.flags) or result.status.value.replace("_", " ")
         if result.status is ContactStatus.OK:

@@ -18,9 +18,9 @@ import numpy as np
 from tkamb.geometry.frames import Array, cross
 from tkamb.knee import unknowns
 from tkamb.knee.chain import ChainState
-from tkamb.knee.contact_points import CondylePoint
 from tkamb.knee.load import PointForces
 from tkamb.knee.unknowns import (
+    CondylePoint,
     LoadState,
     Unknown,
     contradictions,
@@ -275,8 +275,9 @@ class KneeSystem:
         """Return the solution as loads, including the zero loads."""
         values = self.solution.values
         flexion, adduction = self.external_moments()
+        slack = [*map(muscle_load, self.slack), *PATELLAR] if self.slack else []
         return SolvedLoads(
-            values | dict.fromkeys(self._zero_loads(), 0.0),
+            values | dict.fromkeys(slack, 0.0),
             self.contact_force(values),
             flexion,
             adduction,
@@ -338,10 +339,6 @@ class KneeSystem:
         knee = self._outside - hip @ at_hip
         rows = self.geometry.state.chain.knee_columns()
         return -float(knee[rows[5]]), -float(knee[rows[4]])
-
-    def _zero_loads(self) -> list[str]:
-        """Return the names of the extensor loads that are zero if the mechanism is slack."""
-        return [*map(muscle_load, self.slack), *PATELLAR] if self.slack else []
 
     def _extensor(self) -> list[Unknown]:
         extensor, state = self.geometry.extensor, self.geometry.state

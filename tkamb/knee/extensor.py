@@ -535,7 +535,6 @@ class _Poses:
         self._poses = poses
 
     def pose(self, link: str) -> Array:
-        """Return pose_link_in_insert (4, 4)."""
         return self._poses[link]
 
 

@@ -20,9 +20,9 @@ import numpy as np
 
 from tkamb.errors import ComputationError, TkambError
 from tkamb.geometry.frames import Array, Index, Mask, knee_pose
-from tkamb.knee.contact_points import NO_CONTACT, CondylePoint, ContactPoints
 from tkamb.knee.equations import KneeGeometry, SolvedLoads, solve_knee, unsolved
-from tkamb.knee.instant import Instant
+from tkamb.knee.instant import NO_CONTACT, ContactPoints, Instant
+from tkamb.knee.unknowns import CondylePoint
 from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class CouplingSettings:
     """Convergence of the coupling of body and contact in one frame."""
 
     force_tolerance: float = 0.1
-    """N: largest change of the load in a converged iteration. Chosen because no contact model
+    """N: largest change of the load in a converged iteration. No contact model
     resolves a ten-thousandth of a body weight."""
     point_tolerance: float = 1e-6
     """m: largest travel of a centre of pressure in a converged iteration. A smaller travel
@@ -58,7 +58,7 @@ class CouplingSettings:
     """1: relative error of the knee's compliance to muscles above which a released frame gets a
     flag. Not studied."""
     post_overlap: float = 0.5 * MILLIMETRE
-    """m: overlap of cam and post at a recorded pose above which a flag is set. Chosen because it is
+    """m: overlap of cam and post at a recorded pose above which a flag is set. It is
     the usual error of a position from fluoroscopy."""
 
 
@@ -98,7 +98,6 @@ class Frame:
             solution at the recorded pose.
         contact: the contact; None: not modelled, or it could not be computed.
         problem: reason why there is no contact; empty: there is one, or it is not modelled.
-        flags: flags of the contact.
         contact_seconds: computing time of the contact, s.
         iterations: iterations between loads and contact; 0: not coupled.
         load_change: change of the load in the last iteration, N.
@@ -262,7 +261,6 @@ class FrameMethod:
         """Return loads and contacts at an instant.
 
         Args:
-            instant: the knee at one instant.
             before: starts of the earlier frames, for warm start and initial guess.
         """
         frame, button = self._knee_frame(instant, before), self.knee.button_contact
@@ -316,7 +314,6 @@ class FrameMethod:
         """Return the loads at an instant by the equations alone; NaN without a solution.
 
         Args:
-            instant: the knee at one instant.
             adjustment: femoral adjustment; None: computed if the method has one.
         """
         began, problems = clock.perf_counter(), tuple[str, ...]()
@@ -349,7 +346,6 @@ class FrameMethod:
             return None, (error.what,)
 
     def _contact_points(self, instant: Instant, pose: Array) -> ContactPoints:
-        """Return the contact points of the condyles at a pose (4, 4) and their velocities."""
         if self.knee.contact is None:
             return NO_CONTACT
         return instant.contact_points(self.knee._query, pose)
@@ -407,7 +403,6 @@ class FrameMethod:
         checks the adjustment anew.
 
         Args:
-            instant: the knee at one instant.
             body: loads by the equations, with the adjustment before its check.
             frame: the same loads with the contact under them.
         """
@@ -485,7 +480,6 @@ class FrameMethod:
     def _in_equilibrium(
         self, frame: Frame, knee: "KneeEquilibrium", start: "WarmStart | None"
     ) -> Frame:
-        """Return a frame with the contact at the pose of its equilibrium."""
         from tkamb.contact.pressing import within_insert
         from tkamb.geometry.threads import both
 
@@ -540,7 +534,6 @@ class FrameMethod:
         return replace(post, flags=(*post.flags, flag))
 
     def _touched(self, frame: Frame, result: "ContactResult", start: "WarmStart") -> Frame:
-        """Return a frame with the result of the contact model, which may have failed."""
         from tkamb.contact.result import ContactStatus, medial_points
 
         if result.status is not ContactStatus.OK:

@@ -28,13 +28,13 @@ from scipy.integrate import DOP853
 from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array
 
-# Number of Runge-Kutta steps along a geodesic. Chosen because few steps suffice: the method
+# Number of Runge-Kutta steps along a geodesic. Few steps suffice: the method
 # (DOP853) has order eight.
 RUNGE_KUTTA_STEPS = 6
 # A second string in a plane is also tried if its excess over the shortest is less than this share
-# of its own arc. Chosen because it may lead to the shortest geodesic.
+# of its own arc. It may lead to the shortest geodesic.
 RIVAL_SHARE = 0.1
-# Number of half planes through both points that are tried. Chosen as one every 15 deg.
+# Number of half planes through both points that are tried. One every 15 deg.
 PLANES = 24
 
 
@@ -186,7 +186,7 @@ MAX_ITERATIONS = 30
 # Not studied.
 TOLERANCE = 1e-11
 # rad: a geodesic that ends beyond its touching point is shortened if its direction error is
-# smaller than this. Chosen because the derivative may have the wrong sign at larger errors.
+# smaller than this. The derivative may have the wrong sign at larger errors.
 OVERSHOOT_BELOW = 0.05
 
 

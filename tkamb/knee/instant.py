@@ -1,10 +1,10 @@
-"""A knee at one instant: its geometry and loads, at the pose of q or at other knee coordinates.
+"""A knee at one instant: geometry, contact points and loads, at q or at other knee coordinates.
 
 The motion of the shank depends on q, v and a alone. The wrench that the knee must exert on the
 shank is therefore computed only once in a search over knee coordinates.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
@@ -14,18 +14,38 @@ from tkamb.errors import ComputationError
 from tkamb.geometry.frames import SIDES, Array, cross, knee_pose, knee_twist
 from tkamb.knee.canonical import canonical_state
 from tkamb.knee.chain import Chain, ChainMotion
-from tkamb.knee.contact_points import CondylePoint, ContactPoints, contact_points
 from tkamb.knee.equations import KneeGeometry, SolvedLoads, solve_knee, unsolved
 from tkamb.knee.load import PointForces
+from tkamb.knee.unknowns import CONTACT_POINT, CondylePoint
+from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:
     from tkamb.contact.model import CondyleWrench
-    from tkamb.geometry.closest import ClosestPointQuery
+    from tkamb.geometry.closest import ClosestPointQuery, CondyleGap, CondyleGaps
     from tkamb.knee.chain import ChainState
     from tkamb.knee.crossing import MuscleShare
     from tkamb.knee.extensor import ExtensorLines
     from tkamb.knee.ligaments import Ligament
     from tkamb.knee.patella import PatellaState
+
+
+@dataclass(frozen=True, eq=False)
+class ContactPoints:
+    """The femorotibial contact of one pose, as input of the equations.
+
+    Args:
+        condyles: side -> contact point; empty: contact is not modelled.
+        lifted: sides that are lifted off the insert.
+        problems: reasons why the pose cannot be used; empty: it can be used.
+    """
+
+    condyles: dict[str, CondylePoint]
+    lifted: frozenset[str]
+    problems: tuple[str, ...]
+
+
+NO_CONTACT = ContactPoints({}, frozenset(), ())
+"""Contact points of a frame in which contact is not modelled."""
 
 
 class PatellaFinder(Protocol):
@@ -283,3 +303,47 @@ class Instant:
             PointForces("tibia", post.point[None], force[None], couple),
             PointForces("femur", post.point[None], -force[None], -couple),
         )
+
+
+def contact_points(
+    query: "ClosestPointQuery", pose: Array, sliding: Callable[[Array], Array]
+) -> ContactPoints:
+    """Return the contact points of a pose.
+
+    Args:
+        pose: pose_femoral_in_insert, shape (4, 4).
+        sliding: function of a point (3,), m, insert frame. It returns the velocity (3,), m/s, of
+            the femur relative to the insert at that point.
+    """
+    gaps = query.at(pose)
+    condyle_gaps = {"medial": gaps.medial} | ({"lateral": gaps.lateral} if gaps.lateral else {})
+    condyles = {side: _condyle(gap, sliding) for side, gap in condyle_gaps.items()}
+    nearest = nearest_gap(gaps)
+    problems: tuple[str, ...] = ()
+    if abs(nearest) > CONTACT_POINT.max_gap:
+        state = "apart" if nearest > 0 else "overlapping"
+        problems = (f"condyles {state} by {abs(nearest) / MILLIMETRE:.1f} mm",)
+    return ContactPoints(condyles, _find_lifted(condyles), problems)
+
+
+def nearest_gap(gaps: "CondyleGaps") -> float:
+    """Return the smallest gap (m) of the condyles."""
+    return min(gap.gap for gap in (gaps.medial, gaps.lateral) if gap is not None)
+
+
+def _condyle(gap: "CondyleGap", sliding: Callable[[Array], Array]) -> CondylePoint:
+    return CondylePoint(gap.centre, gap.normal, sliding(gap.centre), gap.gap)
+
+
+def _find_lifted(condyles: dict[str, CondylePoint]) -> frozenset[str]:
+    if len(condyles) < 2:
+        return frozenset()
+    medial, lateral = condyles["medial"], condyles["lateral"]
+    # z is medial-lateral: the width is the distance of the contact points in the coronal plane.
+    width = abs(lateral.point[2] - medial.point[2])
+    higher = "lateral" if lateral.gap > medial.gap else "medial"
+    # The coronal angle is small: it is the difference of the gaps over the width.
+    tilted = abs(lateral.gap - medial.gap) > CONTACT_POINT.lift_off_angle * width
+    return frozenset(
+        {higher} if tilted and condyles[higher].gap > CONTACT_POINT.lift_off_gap else ()
+    )

@@ -31,11 +31,11 @@ from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array
 from tkamb.knee.knee import Knee, KneeData
 
-# m/s and rad/s: residual of the step's equation below which Newton's method has converged. Chosen
-# because it is far below any speed of a knee.
+# m/s and rad/s: residual of the step's equation below which Newton's method has converged.
+# It is far below any speed of a knee.
 VELOCITY_TOLERANCE = 1e-8
 # m/s and rad/s: residual below which the step is accepted if Newton's method no longer reduces it.
-# Chosen as a thousand times `VELOCITY_TOLERANCE`.
+# A thousand times `VELOCITY_TOLERANCE`.
 STAGNATION_TOLERANCE = 1e-5
 # Maximum number of evaluations of the residual. Not studied.
 MAX_NEWTON_STEPS = 40

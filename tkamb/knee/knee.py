@@ -24,9 +24,8 @@ from tkamb.geometry.frames import (
 )
 from tkamb.knee.assembled import AssembledKnee, KneeData
 from tkamb.knee.canonical import KneePose, mirrored_spatial, summed
-from tkamb.knee.contact_points import NO_CONTACT
 from tkamb.knee.equations import KneeGeometry
-from tkamb.knee.instant import Instant, PatellaAt, PatellaFinder, SharingMuscles
+from tkamb.knee.instant import NO_CONTACT, Instant, PatellaAt, PatellaFinder, SharingMuscles
 from tkamb.knee.load import PointForces
 from tkamb.knee.loads import KneeLoads, knee_loads
 from tkamb.units import DEGREE, MILLIMETRE
@@ -178,7 +177,7 @@ class Knee(AssembledKnee):
         """
         data = self._data(data)
         if np.ndim(q) == 2:
-            from tkamb.knee.batches import forces_of_all
+            from tkamb.knee.pressed import forces_of_all
 
             return forces_of_all(self, q, v, tensions, data)
         kinematics = self._kinematics(data, q, v)
@@ -198,7 +197,6 @@ class Knee(AssembledKnee):
     def _loads_beside_contact(
         self, data: KneeData, kinematics: KneePose, muscle_tensions: Mapping[str, float]
     ) -> list[PointForces]:
-        """Return the loads of the extensor mechanism, and of ligaments that end on the patella."""
         if not self._loads_patella(muscle_tensions):
             return []
         patella = None if self.extensor_lines is None else self._find_patella(kinematics, data)
@@ -517,7 +515,7 @@ class Knee(AssembledKnee):
             A `tkamb.knee.pressed.KneeContactResult`: pressure, area and forces of both condyles in
             the insert frame. With derivatives, it and
             `tkamb.knee.solution_derivatives.PressDerivatives`. For n poses a
-            `tkamb.knee.batches.PressBatch`.
+            `tkamb.knee.pressed.PressBatch`.
 
         Raises:
             InputError: the knee has no contact model, the load is negative or not finite, or
@@ -527,7 +525,7 @@ class Knee(AssembledKnee):
 
         data = self._data(data, contact=False)
         if np.ndim(q) == 2:
-            from tkamb.knee.batches import press_all
+            from tkamb.knee.pressed import press_all
 
             return press_all(self, q, load, data, derivatives)
         if np.ndim(load):
@@ -836,7 +834,6 @@ class Knee(AssembledKnee):
             )
 
     def _contact_at(self, data: KneeData, kinematics: KneePose) -> "ProbedContact":
-        """Return the contact at a pose. The last contact is stored in `data`."""
         key = kinematics.pose.tobytes()
         if data.seen is None or data.seen[0] != key:
             assert self.contact is not None
@@ -845,7 +842,6 @@ class Knee(AssembledKnee):
         return data.seen[1]
 
     def _crossing_stiffness(self, kinematics: KneePose) -> Array:
-        """Return the stiffness (6, 6) of the ligaments between femur and tibia."""
         if self._crossing is None:
             return np.zeros((6, 6))
         return self._crossing.tangent(kinematics.pose)
@@ -856,7 +852,6 @@ class Knee(AssembledKnee):
         return mirrored_spatial(mirrored_spatial(matrix).T).T
 
     def _solved(self, instant: Instant, geometry: KneeGeometry, data: KneeData) -> KneeLoads:
-        """Return the loads of a geometry, and their forces on the user's joints."""
         geometry, loads = instant.solved(geometry)
         return knee_loads(geometry, loads, self.friction, self.bridge, data.data)
 

@@ -28,7 +28,7 @@ from tkamb.knee.wrap_object import WrapObject
 from tkamb.units import DEGREE, MILLIMETRE
 
 # rad: largest difference between the reference flexion and the flexion of the nearest frame.
-# Chosen because at a larger difference the strain differs.
+# At a larger difference the strain differs.
 MAX_REFERENCE_DISTANCE = 15.0 * DEGREE
 
 
@@ -133,10 +133,10 @@ class Ligament:
 
 PROXIMAL, DISTAL = "proximal", "distal"
 """Names of the two bodies of `BundleArrays`."""
-# m: step of the finite differences of bundles that wrap. Chosen because a path is exact to 1e-11,
+# m: step of the finite differences of bundles that wrap. A path is exact to 1e-11,
 # and its curvature changes over millimetres.
 DIFFERENCE_STEP = 1e-6
-# m: arm that turns the step into a rotation. Chosen as the order of the knee's radius.
+# m: arm that turns the step into a rotation. The order of the knee's radius.
 DIFFERENCE_ARM = 0.03
 
 
@@ -389,8 +389,8 @@ def _frame(poses: Mapping[str, Array], k: int) -> dict[str, Array]:
     }
 
 
-# m: an end farther than this beyond the middle of the knee is on the wrong side. Chosen because
-# collateral ligaments end 20 to 45 mm from the middle, and the frames' origins lie closer to the
+# m: an end farther than this beyond the middle of the knee is on the wrong side.
+# Collateral ligaments end 20 to 45 mm from the middle, and the frames' origins lie closer to the
 # middle than this distance.
 WRONG_SIDE_DISTANCE = 8.0 * MILLIMETRE
 

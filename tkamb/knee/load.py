@@ -22,8 +22,8 @@ class LinkPoint:
     position: Array
 
 
-# m: a point farther from its frame is refused, because it is probably in millimetres. Chosen
-# because a leg is 0.9 m long, and 1 mm is the smallest useful coordinate in millimetres.
+# m: a point farther from its frame is refused, because it is probably in millimetres.
+# A leg is 0.9 m long, and 1 mm is the smallest useful coordinate in millimetres.
 MAX_DISTANCE = 1.0
 
 

@@ -147,7 +147,8 @@ def knee_loads(
         np.asarray(force),
         {
             side: value_of(f"{side}_normal", 0.0 if solved.values else NAN)
-            for side in _sides(geometry)
+            for side in SIDES
+            if side in geometry.condyles
         },
         extensor.tension(values) if extensor else NAN,
         value_of("patellar_ligament", NAN),
@@ -174,10 +175,6 @@ def knee_loads(
         solved,
         geometry,
     )
-
-
-def _sides(geometry: KneeGeometry) -> list[str]:
-    return [side for side in SIDES if side in geometry.condyles]
 
 
 def _mirrored(name: str) -> bool:

@@ -39,7 +39,7 @@ Mesh = Any
 """A `trimesh.Trimesh`, a pair (vertices (n, 3) m, triangles (k, 3)), or a `Surface`."""
 
 
-# m: a longer mesh is refused, because it is probably in millimetres. Chosen because no part of an
+# m: a longer mesh is refused, because it is probably in millimetres. No part of an
 # implant is longer.
 MAX_LENGTH = 0.5
 
@@ -193,7 +193,7 @@ def _arrays(mesh: Mesh, name: str) -> tuple[Array, Any]:
 
 
 # m and rad: difference between the mesh frame and the frame of the flat bottom below which the two
-# are equal. Chosen because it is above rounding errors.
+# are equal. It is above rounding errors.
 FRAME_TOLERANCE = 1e-9
 
 

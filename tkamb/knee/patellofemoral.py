@@ -135,7 +135,6 @@ class PatellofemoralContact:
         self._clear_samples()
 
     def _clear_samples(self) -> None:
-        """Drop all stored distances."""
         count = len(self._samples)
         no_position, zeros = np.full((count, 3), np.inf), np.zeros(count)
         vectors = np.zeros((count, 3)), np.zeros((count, 3))

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 # N: largest difference of a muscle's required force from its applied force at which the iteration
-# has converged. Chosen as a thousandth of a usual muscle force.
+# has converged. A thousandth of a usual muscle force.
 MUSCLE_FORCE_TOLERANCE = 1.0
 
 

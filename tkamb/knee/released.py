@@ -46,39 +46,39 @@ class ReleasedKneeSettings:
     """Tolerances and limits of the passes between knee, patella and muscles."""
 
     knee_tolerance: float = 2e-6
-    """m: movement of the knee between passes below which the passes have converged. Chosen equal to
+    """m: movement of the knee between passes below which the passes have converged. Equal to
     the step tolerance of the search."""
     contact_force_tolerance: float = 0.1
     """N: change of the contact force below which passes have converged, or `contact_force_share` of
-    the force if that is larger. Chosen as a ten-thousandth of a usual contact force."""
+    the force if that is larger. A ten-thousandth of a usual contact force."""
     residual_tolerance: float = 0.5
     """N (moments are divided by the lever arm): largest residual force on a released coordinate,
     with patella, lines and contact of the returned pose. A frame has no result if the residual
     exceeds the largest of this tolerance, `residual_share` of the contact force, and the error of
-    the contact force. Chosen because measured residuals are below 0.1 N."""
+    the contact force. Measured residuals are below 0.1 N."""
     residual_share: float = 1e-3
-    """1: see `residual_tolerance`. Chosen because the facets of the patella change the force by a
+    """1: see `residual_tolerance`. The facets of the patella change the force by a
     share of 2e-4."""
     contact_force_share: float = 2e-4
-    """1: see `contact_force_tolerance`. Chosen because the facets of the patella change the force
+    """1: see `contact_force_tolerance`. The facets of the patella change the force
     by about this share."""
     max_passes: int = 24
-    """Maximum number of passes. Chosen because a pass halves the change of a compliant knee."""
+    """Maximum number of passes. A pass halves the change of a compliant knee."""
     inner_tolerance_share: float = 0.1
     """1: a pass with muscles ends when its remaining Newton step is less than this share of the
-    knee's movement in the pass. Chosen because more passes follow in any case."""
+    knee's movement in the pass. More passes follow in any case."""
     muscle_force_range: float = 3e-3
     """m: distance from the initial guess at which a pass ends if the last frame gave the muscle
-    forces. Chosen because the knee moves by less from frame to frame."""
+    forces. The knee moves by less from frame to frame."""
     slack_force: float = 1e-3
-    """N: an extensor group with a smaller tension is slack. Chosen because it is far below the
+    """N: an extensor group with a smaller tension is slack. It is far below the
     resolution of the reports."""
     initial_load_error: float = 0.5
     """1: largest relative difference between the load at a guess and the load of the last frame.
     Not studied."""
     max_height_steps: int = 4
     """Maximum number of heights that are tried to bring the load within `initial_load_error`.
-    Chosen because each height costs one evaluation of the contact."""
+    Each height costs one evaluation of the contact."""
 
 
 RELEASED_KNEE = ReleasedKneeSettings()
@@ -96,7 +96,6 @@ class KneeEquilibrium:
         patella: the patella at these coordinates; None: not modelled.
         contact: the contact at these coordinates.
         balance: result of the last pass.
-        passes: number of passes.
         trials: number of evaluations of the contact in all passes.
         change: change of the contact force in the last pass, N.
         problem: reason why the search failed; empty: it succeeded.
@@ -150,7 +149,6 @@ class ReleasedKnee:
     """Finds the released coordinates of a knee, instant by instant.
 
     Args:
-        probe: probe of the contact model.
         names: names of released coordinates; "si" is always released.
 
     Attributes:
@@ -173,7 +171,6 @@ class ReleasedKnee:
         """Return the knee in equilibrium.
 
         Args:
-            instant: the knee at one instant.
             start: knee coordinates with an initial guess of the released coordinates, shape (6,).
             points: side -> point (3,), m, where an unloaded condyle is nearest to the insert. The
                 residual forces act in the middle of the two condyles' points.
@@ -248,7 +245,6 @@ class ReleasedKnee:
         """Return the equations of the released coordinates at a geometry and its contact.
 
         Args:
-            instant: the knee at one instant.
             geometry: result of `Instant.geometry`.
             contact: the contact at the geometry's coordinates.
             points: side -> point where an unloaded condyle is nearest to the insert.
@@ -276,7 +272,6 @@ class ReleasedKnee:
     def _measured(
         self, instant: Instant, knee: KneeEquilibrium, middle: Array, slack: bool
     ) -> KneeEquilibrium:
-        """Return the knee with patella, lines and residual of its final pose."""
         if knee.problem:
             return knee
         patella = None
@@ -390,7 +385,6 @@ class ReleasedKnee:
         the contact force acts at the femoral origin.
 
         Args:
-            instant: the knee at one instant.
             geometry: input of the equations, without the contact.
             joint: equations of the released coordinates with a taut extensor mechanism.
             last_contact: the contact at this pose, from the last pass or from `_at_load`; None:
@@ -432,7 +426,6 @@ class ReleasedKnee:
 
     @property
     def _has_residual_forces(self) -> bool:
-        """Whether residual forces act, because a coordinate keeps its recorded value."""
         return len(self.released) < 5
 
     def _joint(

@@ -26,10 +26,10 @@ import numpy as np
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, inverse, knee_axes, knee_pose, transform
 from tkamb.knee import unknowns
 from tkamb.knee.balance import Balance, Trial, find_balance
-from tkamb.knee.contact_points import CondylePoint
 from tkamb.knee.crossing import MuscleShare
 from tkamb.knee.equations import KneeGeometry
 from tkamb.knee.load import wrench_of
+from tkamb.knee.unknowns import CondylePoint
 
 if TYPE_CHECKING:
     from tkamb.contact.model import Probe, ProbedContact
@@ -261,10 +261,10 @@ def crossing_bundles(
     return BundleArrays.between(crossing)
 
 
-# m: arm that makes rotations comparable to translations. Chosen as half the usual distance of the
+# m: arm that makes rotations comparable to translations. Half the usual distance of the
 # condyles.
 LEVER_ARM = 0.025
-# m: step of the finite differences of joint axes and ligaments. Chosen because it is far above
+# m: step of the finite differences of joint axes and ligaments. It is far above
 # rounding errors and far below any radius of curvature.
 DIFFERENCE_STEP = 1e-7
 
@@ -303,7 +303,6 @@ class FreeForces(Generic[J]):
 
     Args:
         joint: loads other than contact.
-        probe: probe of the contact model.
         coordinates: knee coordinates, shape (6,), m and rad; coordinates that are not free keep
             their values.
         friction: Coulomb coefficient.

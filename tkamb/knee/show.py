@@ -21,16 +21,16 @@ COLOURS = {"femoral": 0xB8C4CE, "insert": 0xEFEBDD, "patella": 0xEFEBDD}
 LIGAMENT, MUSCLE, ARROW = 0x2E7D32, 0xB71C1C, 0x1A1A1A
 
 
-# m: radius of the force arrows. Chosen because it is easy to see.
+# m: radius of the force arrows. It is easy to see.
 ARROW_RADIUS = 1.5e-3
-# m: radius of ligaments, muscles and the patellar ligament. Chosen because it is easy to see.
+# m: radius of ligaments, muscles and the patellar ligament. It is easy to see.
 STRAND_RADIUS = 8e-4
-# m: distance of the camera from the knee. Chosen because the implant then fills the window.
+# m: distance of the camera from the knee. The implant then fills the window.
 LOOK_DISTANCE = 0.15
-# m: height above the insert's origin at which the camera looks. Chosen as the height of the joint.
+# m: height above the insert's origin at which the camera looks. The height of the joint.
 LOOK_HEIGHT = 0.02
-# 1: direction to the camera, insert frame of a right knee: anterior, superior, lateral. Chosen
-# because both condyles and the pressure map are in view.
+# 1: direction to the camera, insert frame of a right knee: anterior, superior, lateral.
+# Both condyles and the pressure map are in view.
 LOOK_DIRECTION = (0.77, 0.40, 0.50)
 
 
@@ -56,7 +56,6 @@ def show_knee(
     first drawing.
 
     Args:
-        knee: the knee.
         viewer: a `pin.visualize.MeshcatVisualizer`, or a `meshcat.Visualizer`.
         q: configuration, shape (nq,).
         contact: contact from `Knee.press` or `Knee.evaluate`; the femur is drawn at its pose. None:

@@ -68,7 +68,6 @@ def press_derivatives(
     """Return the derivatives of a press.
 
     Args:
-        pair: the two bodies.
         pose: pose of the femoral component after the press, shape (4, 4).
         contact: the contact at this pose, with its exact tangent.
     """
@@ -149,7 +148,6 @@ class ImplicitEquilibrium:
 
     Args:
         search: the search that found the solution.
-        instant: the knee at its instant.
         knee: the solution.
         points: side -> point where an unloaded condyle is nearest to the insert.
     """

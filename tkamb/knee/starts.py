@@ -24,22 +24,22 @@ class InitialPoseSettings:
     """Limits of the initial guesses of the released coordinates."""
 
     max_extrapolation: float = 2e-3
-    """m: largest extrapolation from the last frame. Chosen because a guess far from the solution
+    """m: largest extrapolation from the last frame. A guess far from the solution
     costs more time than it saves."""
     first_penetration: float = 5e-5
-    """m: penetration of an initial guess at first touch. Chosen because a loaded contact of
+    """m: penetration of an initial guess at first touch. A loaded contact of
     polyethylene has more penetration, and the search also finds a lightly loaded contact from this
     guess."""
     max_continuation: float = 1e-3
     """m (rotations times the lever arm): distance of an equilibrium from its initial guess above
-    which other guesses are tried, because there may be a second equilibrium. Chosen because the
+    which other guesses are tried, because there may be a second equilibrium. The
     shipped knee moves by 0.5 mm at most between frames."""
     other_shift: float = 5e-3
     """m: shift of the recorded pose in anterior and posterior direction, for two more initial
-    guesses of a first frame. Chosen as about a third of a dish."""
+    guesses of a first frame. About a third of a dish."""
     same_place: float = 0.5e-3
-    """m (rotations times the lever arm): distance above which two equilibria are different. Chosen
-    because it is well above the tolerances of the search."""
+    """m (rotations times the lever arm): distance above which two equilibria are different.
+    It is well above the tolerances of the search."""
 
 
 INITIAL_POSE = InitialPoseSettings()
@@ -52,7 +52,6 @@ class InitialPoses:
 
     Args:
         knee: object that searches from an initial guess.
-        pair: femoral component and insert.
         post: cam and post; None: not modelled.
     """
 
@@ -69,7 +68,6 @@ class InitialPoses:
         `second` of the result describes it.
 
         Args:
-            instant: the knee at one instant.
             previous: results of up to three previous frames, in their order.
             points: side -> point (3,), m, where an unloaded condyle is nearest to the insert.
 

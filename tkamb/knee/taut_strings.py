@@ -37,7 +37,7 @@ from tkamb.knee.geodesic import dot, shortest_strings, unit
 from tkamb.knee.wrap_object import WrapObject
 from tkamb.knee.wrapping import is_inside, taut_path
 
-# Number of angles on a torus's ring at which the string is tried. Chosen as one every 7.5 deg.
+# Number of angles on a torus's ring at which the string is tried. One every 7.5 deg.
 RING_PLACES = 48
 # Gap between a shrunken ellipsoid and the point inside the original one, as a share of the
 # ellipsoid's size. Not studied.
@@ -280,7 +280,7 @@ def _ellipsoid(
 
 # Largest number of sweeps over all objects. A string that needs more fails. Not studied.
 MAX_SWEEPS = 100
-# Largest extrapolation, as a multiple of the last step. Chosen because two sweeps do not support a
+# Largest extrapolation, as a multiple of the last step. Two sweeps do not support a
 # larger one.
 MAX_EXTRAPOLATION = 10.0
 # m: a string has converged if a sweep changes no coordinate of a touching point by more.
@@ -377,7 +377,6 @@ class _Strings:
         self.arc, self.push = np.zeros(shape), np.zeros((*shape, 2, 3))
 
     def result(self) -> WrappedStrings:
-        """Return the strings as a result."""
         return WrappedStrings(self.order, self.entry, self.exit, self.arc, self.push)
 
     def places(self) -> Array:
@@ -385,7 +384,6 @@ class _Strings:
         return np.concatenate([self.entry, self.exit], axis=2).reshape(len(self.start), -1)
 
     def place(self, places: Array) -> None:
-        """Set the touching points from rows (f, 6w), m."""
         points = places.reshape(*self.order.shape, 6)
         self.entry, self.exit = points[..., :3].copy(), points[..., 3:].copy()
 
@@ -396,7 +394,6 @@ class _Strings:
             self.insert(w, rows[allowed[rows, w]])
 
     def remove(self, w: int, rows: Index) -> None:
-        """Remove object w from the path of some strings."""
         order = np.where(self.order[rows] == w, -1, self.order[rows])
         closed = np.argsort(order < 0, axis=1, kind="stable")
         self.order[rows] = np.take_along_axis(order, closed, axis=1)

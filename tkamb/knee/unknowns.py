@@ -1,4 +1,4 @@
-"""The unknown loads of the knee at one frame, and which of them act.
+"""The unknown loads of the knee at one frame, their contact points, and which of them act.
 
     sum_k J_k(q)^T w_k x_k = RNEA(q, v, a) - sum_known J^T w_known
 
@@ -24,14 +24,63 @@ from typing import NamedTuple
 import numpy as np
 
 from tkamb.geometry.frames import Array, cross
-from tkamb.knee.contact_points import CondylePoint
 from tkamb.knee.load import PointForces
+from tkamb.units import DEGREE, MILLIMETRE
 
 # 1: condition number (unit columns) above which a frame counts as singular. The number is about 7
 # to 9 m / d, where d is the moment arm of the patellar ligament about the femorotibial contact.
-# Chosen because at the limit, d = 0.8 mm, an error of 1 mm in a line of action changes the force
+# At the limit, d = 0.8 mm, an error of 1 mm in a line of action changes the force
 # by more than 100 %.
 MAX_CONDITION = 1e4
+
+
+@dataclass(frozen=True)
+class ContactPointSettings:
+    """Limits of lift-off, gap and sliding speed of the condyles."""
+
+    lift_off_angle: float = 0.5 * DEGREE
+    """rad: a condyle is lifted off if the coronal angle from both gaps exceeds this angle, and the
+    condyle's gap exceeds `lift_off_gap`. Source: error of fluoroscopy (Sharma 2008, 4.3)."""
+    lift_off_gap: float = 0.5 * MILLIMETRE
+    """m: gap above which a condyle may be lifted off, see `lift_off_angle`. Source: error of
+    fluoroscopy (Sharma 2008, 4.3)."""
+    max_gap: float = 3e-3
+    """m: a femoral component with a larger gap or penetration is misplaced. It is
+    larger than the errors of fluoroscopy."""
+    standstill_speed: float = 1e-3
+    """m/s: v0 of the regularised friction. Friction fades below this sliding speed.
+    It is far below the sliding speed of a moving knee."""
+
+
+CONTACT_POINT = ContactPointSettings()
+
+
+@dataclass(frozen=True, eq=False)
+class CondylePoint:
+    """The contact point of one condyle on the insert, insert frame.
+
+    Args:
+        point: position, shape (3,), m.
+        normal: unit normal from the insert to the femur, shape (3,).
+        sliding: velocity of the femur relative to the insert at the point, shape (3,), m/s.
+        gap: gap, positive when apart, m.
+    """
+
+    point: Array
+    normal: Array
+    sliding: Array
+    gap: float
+
+    def direction(self, friction: float) -> Array:
+        """Return the contact force on the femur (3,) per unit normal force.
+
+        The result is n - mu t with t = v / sqrt(|v|² + v0²) for the tangential velocity v: Coulomb
+        friction that fades below v0 = 1 mm/s.
+        """
+        tangential = self.sliding - (self.sliding @ self.normal) * self.normal
+        # Without v0 the direction of the force would jump when the sliding reverses.
+        speed = np.sqrt(tangential @ tangential + CONTACT_POINT.standstill_speed**2)
+        return np.asarray(self.normal - friction * tangential / speed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,10 +252,10 @@ def residuals(point: Array, lifted: bool, extensor: bool) -> list[Unknown]:
     return unknowns
 
 
-# N: a smaller force of the wrong sign counts as zero. Chosen because it is above rounding errors.
+# N: a smaller force of the wrong sign counts as zero. It is above rounding errors.
 FORCE_ROUNDING = 1e-6
-# N·m: largest extension moment that may be missing if the extensor mechanism is slack. Chosen
-# because weight and inertia of the patella, up to 5 N on an arm of 45 mm, cause such a moment.
+# N·m: largest extension moment that may be missing if the extensor mechanism is slack.
+# Weight and inertia of the patella, up to 5 N on an arm of 45 mm, cause such a moment.
 PATELLA_MOMENT = 0.25
 
 

@@ -29,7 +29,6 @@ class WrapObject:
 
     Args:
         name: the object's name.
-        body: name of the body.
         shape: "cylinder" (along its z), "sphere", "ellipsoid", "torus" (about its z) or "section"
             (along its z).
         pose: (4, 4) pose_object_in_body.

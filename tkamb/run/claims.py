@@ -141,8 +141,6 @@ class MeasuredTrial:
     """Error of tkamb in a trial with measured forces; docs/truth.md has the same numbers.
 
     Args:
-        trial: name of the trial.
-        subject: name of the subject.
         activity: name of the activity, as in [output] activity.
         muscles: True: all muscles of the leg; False: the quadriceps alone.
         rmse_BW: force -> root mean square error, BW.

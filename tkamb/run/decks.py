@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from tkamb.run.frame_press import PressProblem
 
 
-# N/mm³: contact stiffness. Chosen because the penetration is then 0.3 µm at 30 MPa.
+# N/mm³: contact stiffness. The penetration is then 0.3 µm at 30 MPa.
 PENALTY = 1e5
 
 
@@ -167,7 +167,6 @@ def febio_text(problem: "PressProblem", approach: float, comments: Iterable[str]
     """Return the .feb file of a contact problem.
 
     Args:
-        problem: contact problem.
         approach: displacement of the femoral component along -y from first touch, m.
         comments: lines at the top of the file.
 

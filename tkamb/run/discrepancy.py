@@ -99,7 +99,7 @@ class DiscrepancySettings:
     published_lateral_numbers: int = 4
     """1: number of published errors of the lateral force."""
     fewest_frames: int = 5
-    """1: least number of frames of a trial. Chosen because a standard deviation of fewer values is
+    """1: least number of frames of a trial. A standard deviation of fewer values is
     uncertain by more than a third."""
 
 
@@ -113,8 +113,6 @@ class TrialError:
     The error is measured minus predicted force, as a share of the load G.
 
     Args:
-        trial: name of the trial.
-        subject: name of the subject.
         activity: name of the activity, as in [output] activity.
         force: total, medial or lateral.
         frames: number of compared frames.

@@ -30,10 +30,10 @@ from tkamb.run.results import Results
 from tkamb.run.results_folder import SUMMARY_NAME, read_results
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
-# 1: nodes with a gap at first touch below this multiple of the guessed depth can touch. Chosen
-# because the error of the guess is smaller.
+# 1: nodes with a gap at first touch below this multiple of the guessed depth can touch.
+# The error of the guess is smaller.
 TOUCHABLE_DEPTHS = 2.0
-# 1: largest y component of the normal of a femoral face in the patch. Chosen because steeper faces
+# 1: largest y component of the normal of a femoral face in the patch. Steeper faces
 # do not press on the insert.
 LARGEST_NORMAL_Y = -0.3
 
@@ -213,7 +213,6 @@ def frame_press(folder: Path, frame: int, resolution_mm: float | None = None) ->
 def _notes(
     results: Results, frame: int, pair: ContactPair, model: type[ContactModel]
 ) -> Iterator[str]:
-    """Yield the differences between deck and run, apart from the discretisation."""
     law = pair.material
     yield (
         f"Material '{law.name}', {'linear' if law.is_linear else 'nonlinear'}: "
@@ -231,7 +230,6 @@ def _notes(
 
 
 def _pair(results: Results) -> tuple[ContactPair, float]:
-    """Return femoral component and insert of a run, and the spacing of its map points, mm."""
     case = case_of_results(results)
     table, insert = case.scene.contact, case.scene.implant.insert
     assert table is not None and insert is not None

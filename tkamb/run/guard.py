@@ -189,7 +189,6 @@ def open_streams() -> None:
 
 
 def _watch(stream: TextIO) -> None:
-    """Make a stream raise `StreamError` if it cannot be written, and escape control characters."""
     for name in ("write", "flush"):
         inner = getattr(stream, name)
 
@@ -206,7 +205,6 @@ def _watch(stream: TextIO) -> None:
 
 
 def _silence(stream: object) -> None:
-    """Redirect a standard stream to the null device, so that its final flush does not fail."""
     with suppress(OSError, ValueError, AttributeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())  # type: ignore[attr-defined]
 
@@ -238,7 +236,6 @@ def unforeseen_words(error: Exception, options: argparse.Namespace) -> str:
 
 
 def _write_log(error: Exception, options: argparse.Namespace) -> Path | None:
-    """Write the traceback to the first writable folder; None: no folder is writable."""
     text = "".join(
         (
             f"tkamb {__version__}, {datetime.now(UTC).isoformat(timespec='seconds')}\n",

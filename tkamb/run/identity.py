@@ -8,7 +8,7 @@ import hashlib
 import json
 import os
 import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
@@ -68,15 +68,12 @@ def package_code(module: str) -> str:
         raise ImportError(f"no package of module '{module}'")
     digest = hashlib.sha256()
     for root in spec.submodule_search_locations or ():
-        for path in sorted(_code_in(Path(root))):
+        files = (path for path in Path(root).rglob("*") if path.suffix in SUFFIXES)
+        for path in sorted(filter(Path.is_file, files)):
             digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
     if spec.submodule_search_locations is None and spec.origin is not None:
         digest.update(Path(spec.origin).read_bytes())
     return digest.hexdigest()
-
-
-def _code_in(folder: Path) -> Iterable[Path]:
-    return (path for path in folder.rglob("*") if path.suffix in SUFFIXES and path.is_file())
 
 
 def scene_hash(scene: "Scene") -> str:
@@ -239,7 +236,6 @@ def same_files(case: "Case", summary: Mapping[str, Any]) -> bool:
 
 
 def _scene_of(summary: Mapping[str, Any]) -> "Scene":
-    """Return the scene of a results folder with the contact settings of the run."""
     from tkamb.io.scene import load_scene
 
     name = summary.get("scene")

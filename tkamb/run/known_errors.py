@@ -34,7 +34,7 @@ LEAST_PAIRS = 4
 # 1: largest sag of the facets over the approach. Measured: a ball of facets of 10 by 5 deg has
 # 0.42; its approach was 29 % too small, and its peak pressure that of a fine mesh.
 MOST_SAG = 0.45
-# m: distance from the loaded points within which facets count. Chosen: half the width of the
+# m: distance from the loaded points within which facets count. Half the width of the
 # widest facets of 10 deg.
 FACET_REACH = 2.0 * MILLIMETRE
 
@@ -176,10 +176,8 @@ def stated_error(
     meshes.
 
     Args:
-        model: name of the contact model.
         resolution_mm: spacing of the map points, mm.
         material: name of the insert's material.
-        options: options of the contact model.
         contact: the contact that the error is stated for.
     """
     error = known_error(model, resolution_mm, material, options)
@@ -237,7 +235,6 @@ def known_error(
         model: name of the contact model. Plug-ins were not measured.
         resolution_mm: spacing of the map points, mm. Only the spacings of the study were measured.
         material: material of the insert. Polyethylene and polyethylene-linear were measured.
-        options: options of the contact model.
     """
     label = setting_label(model, options or {})
     return known_errors().get((label, float(resolution_mm), material))

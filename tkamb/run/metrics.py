@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from tkamb.run.results import Results
 
 
-# m: least travel of a centre of pressure in a frame that counts as a jump. Chosen because a
+# m: least travel of a centre of pressure in a frame that counts as a jump. A
 # contact point on one dish moves less in a frame.
 JUMP = 8.0 * MILLIMETRE
-# 1: a jump is also larger than this multiple of the median travel. Chosen because no movement
+# 1: a jump is also larger than this multiple of the median travel. No movement
 # accelerates as much.
 JUMP_STEPS = 5.0
-# N: quadriceps tension below which ratios to it are not shown. Chosen because ratios of small
+# N: quadriceps tension below which ratios to it are not shown. Ratios of small
 # numbers are meaningless.
 LEAST_TENSION = 1.0
 
@@ -33,7 +33,6 @@ class Peak:
 
     Args:
         value: value in the unit of the column.
-        frame: index of the frame.
         side: "medial" or "lateral"; "" for a column without sides.
     """
 

@@ -47,18 +47,18 @@ from tkamb.run.known_errors import (
 )
 from tkamb.units import DEGREE, LENGTH, MEGAPASCAL, MILLIMETRE
 
-# N: largest load. Chosen because it exceeds a hundred body weights.
+# N: largest load. It exceeds a hundred body weights.
 MAX_LOAD = 1e5
-# rad: largest rotation of the femoral component about the vertical without a note. Chosen because
-# no knee rotates farther.
+# rad: largest rotation of the femoral component about the vertical without a note.
+# No knee rotates farther.
 MAX_TURN = 30.0 * DEGREE
 # rad: range of flexion in which the component is upside down. The flexion is estimated from the
-# shape, with an error of 10 deg. Chosen because no knee flexes beyond 160 deg.
+# shape, with an error of 10 deg. No knee flexes beyond 160 deg.
 UPSIDE_DOWN = (170.0 * DEGREE, 250.0 * DEGREE)
-# rad: flexion below which the flange faces the insert and a note is given. Chosen because no knee
+# rad: flexion below which the flange faces the insert and a note is given. No knee
 # extends as far.
 MIN_FLEXION = -60.0 * DEGREE
-# rad: largest angle of the component's medial-lateral axis from the horizontal. Chosen because no
+# rad: largest angle of the component's medial-lateral axis from the horizontal. No
 # knee tilts as far.
 MAX_TILT = 45.0 * DEGREE
 
@@ -77,15 +77,12 @@ class PressReport:
     """The result of a press, with its computing time and memory.
 
     Args:
-        contact: name of the contact model.
         resolution_mm: spacing of the map points, mm.
         nodes: number of nodes of lattice or mesh; of map points for a model without nodes.
         load: load, N.
         result: contact result in the insert frame (mirrored for a left knee).
         adjustment: femoral adjustment before contact; None: without.
         triangles: indices of neighbouring map points, (k, 3).
-        pair: femoral component and insert.
-        side: side of the knee.
         prepare_seconds: computing time of the preparation, s.
         solve_seconds: computing time of the press, s.
         peak_rss_MB: largest resident memory of the process, MB.
@@ -223,7 +220,6 @@ def _naming_remarks(pair: ContactPair, pose: Array) -> list[str]:
 
 
 def _check_orientation(femoral: Surface, pose: Array, path: str | Path) -> None:
-    """Raise an InputError for a femoral component that lies on its side or is upside down."""
     shape = orientation(femoral, pose)
     if shape is None:
         return
@@ -359,7 +355,6 @@ def _check_load(load: float) -> None:
 def _adjustment_settings(
     adjust: bool, restore_when: RestoreRule | None
 ) -> AdjustmentSettings | None:
-    """Return the settings of the adjustment; None: no adjustment."""
     if restore_when not in (None, *get_args(RestoreRule)):
         raise InputError(
             f"'{restore_when}' is not a rule",

@@ -16,10 +16,11 @@ from tkamb.geometry.frames import Array, inverse, knee_pose, sagittal_pose
 from tkamb.io.scene import Scene, load_scene
 from tkamb.io.scene.case import Case, load_case
 from tkamb.knee.chain import ChainMotion
-from tkamb.knee.contact_points import CONTACT_POINT, nearest_gap
 from tkamb.knee.frame import FrameMethod
+from tkamb.knee.instant import nearest_gap
 from tkamb.knee.knee import Knee
 from tkamb.knee.parts import Extensor, Implant
+from tkamb.knee.unknowns import CONTACT_POINT
 from tkamb.run.recording import Ground, Motion, Recording
 from tkamb.units import MILLIMETRE
 
@@ -41,7 +42,6 @@ class SharedState:
     """State that a sample (a case with changed inputs) shares with the nominal case.
 
     Args:
-        pair: femoral component and insert.
         muscles: muscles of [muscles], possibly with other strengths than the nominal ones.
         extensor: extensor mechanism of the nominal case. Its patella is the initial guess for the
             patella of the sample.
@@ -93,7 +93,6 @@ def recording_of(
     """Return the knee of a case in the frames of its motion. The contact is not prepared here.
 
     Args:
-        case: scene with its files read.
         shared: state of the nominal case, for a sample; None: the case is no sample.
         near: whether to skip the check that the condyles are near the insert.
         contact: prepared contact model; None: the contact model of the scene.
@@ -130,7 +129,6 @@ def recording_of(
 
 
 def _method(case: Case, knee: Knee, split_sensitivity: bool, cam: "CamPost | None") -> FrameMethod:
-    """Return how the frames of a case are computed."""
     table, adjust = case.scene.contact, None
     if table is None:
         return FrameMethod(knee)
@@ -165,7 +163,6 @@ def link_poses(case: Case, poses: Array, extensor: "ExtensorFrames | None") -> d
     """Return link -> recorded pose_link_in_insert, (f, 4, 4), for all links with attachments.
 
     Args:
-        case: the case.
         poses: recorded pose_femur_in_insert, (f, 4, 4).
         extensor: patella in all frames; None: not modelled.
     """
@@ -186,7 +183,6 @@ def link_poses(case: Case, poses: Array, extensor: "ExtensorFrames | None") -> d
 
 
 def _knee(case: Case, shared: SharedState | None, contact: "KneeContact | None") -> Knee:
-    """Return the knee of a case, without its ligaments."""
     scene, extensor = case.scene, None
     table, insert = scene.contact, scene.implant.insert
     implant = Implant(case.femoral, case.insert, case.patella, placed=True)
@@ -282,7 +278,6 @@ def _extensor_frames(
 
 
 def _motion(case: Case, extensor: "ExtensorFrames | None") -> Motion:
-    """Return the motion of the model of a case."""
     motion, tibia, states = case.motion, case.tibia, []
     still = (np.eye(4), np.zeros(6), np.zeros(6))
     for k, rows in enumerate(
@@ -298,7 +293,6 @@ def _motion(case: Case, extensor: "ExtensorFrames | None") -> Motion:
 
 
 def _ground(case: Case, motion: Motion) -> Ground | None:
-    """Return the ground reaction as forces on the joints; None if it is not measured."""
     ground, table, model = case.ground, case.scene.ground_reaction, case.chain.model
     if ground is None or table is None:
         return None

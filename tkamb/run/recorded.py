@@ -21,9 +21,9 @@ LAGS = np.arange(-40, 41) * 0.005
 
 
 # 1: least difference between the largest correlation and those at the first and last lag. With a
-# smaller difference no lag is given. Chosen because rounding errors are smaller.
+# smaller difference no lag is given. Rounding errors are smaller.
 LEAST_CORRELATION_RISE = 1e-6
-# 1: least number of frames for correlation and lag. Chosen because a correlation of fewer values
+# 1: least number of frames for correlation and lag. A correlation of fewer values
 # means little.
 FEWEST_FRAMES = 8
 

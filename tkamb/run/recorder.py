@@ -190,7 +190,6 @@ def check_same_run(
     Args:
         earlier: identity of the run in the folder; None: no run.
         identity: identity of the run to resume.
-        directory: the folder, for the message.
     """
     if earlier is None:
         return
@@ -252,7 +251,6 @@ class Recorder:
         """Store a finished frame.
 
         Args:
-            frame: number of the frame.
             row: column of results.csv -> value.
             contact: arrays of the contact result (`frame_arrays`); None: contact failed or is not
                 modelled.
@@ -308,7 +306,6 @@ class FolderRecorder(Recorder):
 
     Args:
         directory: folder that this process has claimed (`tkamb.io.claim`).
-        identity: identity of the run.
         resume: whether to continue an earlier run in the folder.
 
     Raises:

@@ -74,7 +74,6 @@ class Recording:
 
     Args:
         method: how a frame of the knee, which is that of a right leg, is computed.
-        motion: motion of the knee's model.
         ground: ground reaction; None: not measured.
         extensor: patella in all frames; None: not modelled.
         muscles: muscles of [muscles]; None: the quadriceps is the only muscle.
@@ -156,7 +155,6 @@ class Recording:
         """Return loads and contact of frame k.
 
         Args:
-            k: index of the frame.
             before: starts of the earlier frames, for warm start and initial guess.
         """
         began, instant = clock.perf_counter(), self.instant(k)

@@ -80,7 +80,6 @@ def verify_results(directory: str | Path, inputs: str | Path | None = None) -> V
     Nothing is written.
 
     Args:
-        directory: results folder.
         inputs: folder with copies of scene and inputs, at any depth. Default: the folder `inputs`
             of a pack, if there is one, else the folder of the run.
 
@@ -106,7 +105,6 @@ def verify_results(directory: str | Path, inputs: str | Path | None = None) -> V
 
 
 def _input(path: Path, recorded: str) -> str | None:
-    """Return a message on an input file; None: it has not changed."""
     path = Path(os.path.normpath(path))
     try:
         same = sha256_of(path, MESH_BYTES) == recorded  # the limit of input files
@@ -159,7 +157,6 @@ def inputs_folder(
     """Return the folder of the scene of a run, or of its copy.
 
     Args:
-        directory: results folder.
         summary: content of its summary.json.
         given: folder in which to look for a copy of the scene.
 
@@ -188,7 +185,6 @@ class Rerun:
     Args:
         columns: column -> largest difference, as a share of its largest value or of one unit.
         statuses: number of frames with another status.
-        frames: number of frames.
     """
 
     columns: Mapping[str, float]
@@ -220,7 +216,6 @@ def rerun(directory: str | Path, inputs: str | Path | None = None) -> Rerun:
     """Compute a run again and compare all columns with the stored ones.
 
     Args:
-        directory: results folder.
         inputs: as in `verify_results`.
 
     Raises:
@@ -272,7 +267,6 @@ def pack(directory: str | Path, archive: str | Path) -> int:
     Their places relative to each other stay, so that the scene finds them.
 
     Args:
-        directory: results folder.
         archive: path of the archive, *.zip.
 
     Returns:

@@ -26,10 +26,10 @@ PERCENTILES = {"p05": 5.0, "p50": 50.0, "p95": 95.0}
 """Suffix of a column of bands.csv -> percentile of the samples, per cent."""
 
 
-# 1: least number of samples. Chosen because the 5th percentile of 20 samples lies between the two
+# 1: least number of samples. The 5th percentile of 20 samples lies between the two
 # smallest.
 MIN_SAMPLES = 20
-# 1: largest share of failed samples. Chosen because a minority is not representative.
+# 1: largest share of failed samples. A minority is not representative.
 MAX_FAILED_SHARE = 0.5
 
 
@@ -218,7 +218,6 @@ def csv_rows(columns: Mapping[str, Any]) -> Iterator[Sequence[str]]:
 
 
 def _cells(kind: str, values: Iterable[Any]) -> Iterator[str]:
-    """Yield the cells of a column."""
     if kind == "text":
         return map(str, values)
     text = _integer if kind == "integer" else repr

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from tkamb import __version__
 from tkamb.errors import InputError
 from tkamb.files import (
     MEGABYTE,
@@ -24,9 +25,9 @@ from tkamb.files import (
     write_synced,
 )
 from tkamb.io.claim import claimed_directory
+from tkamb.run.columns import COLUMNS, FAMILIES, KINDS, belongs
 from tkamb.run.results import Results, csv_rows, read_bands, read_csv
 from tkamb.run.summary_check import check_summary
-from tkamb.run.table_metadata import table_metadata
 
 if TYPE_CHECKING:
     from tkamb.run.maps import ContactMaps
@@ -142,7 +143,6 @@ def write_results(
     Files of an earlier run in the folder are replaced or removed, and `.frames` is removed.
 
     Args:
-        results: the results.
         directory: path of the folder, which is created if it does not exist.
         force: whether to write into a folder with files that are not tkamb's.
         more: name in `UNCERTAINTY_NAMES` -> function that writes the file at a path. Other files of
@@ -172,7 +172,6 @@ def put_numbers(results: Results, files: Replacement) -> None:
     """Write results.csv, and summary.json with the SHA-256 of the files beside it.
 
     Args:
-        results: the results.
         files: replacement of the folder's files. A contact.h5 of the folder is kept if the
             replacement has none; old files of `UNCERTAINTY_NAMES` are removed.
     """
@@ -235,3 +234,58 @@ def remove_shards(directory: Path, name: str = FOLDER) -> None:
             path.unlink(missing_ok=True)
     with suppress(OSError):  # it does not exist, or it has files that are not tkamb's
         folder.rmdir()
+
+
+UNITS = {
+    "N_per_mm": "N/mm",
+    "N_per_deg": "N/deg",
+    "mm_per_s": "mm/s",
+    "seconds": "s",
+    "percent": "%",
+    "mm2": "mm²",
+    "Nm": "N·m",
+    **{unit: unit for unit in ("N", "mm", "MPa", "deg", "s", "BW")},
+}
+"""End of a column's name -> its unit. Longer ends come first."""
+DATATYPES = {"text": "string", "integer": "integer"}
+
+
+def unit_of(column: str) -> str:
+    """Return the unit of a column; "1": a share, a number or a text."""
+    if "_per_dome_mm_" in column:
+        return "N/mm"
+    return next((unit for end, unit in UNITS.items() if column.endswith(f"_{end}")), "1")
+
+
+def table_metadata(columns: Mapping[str, Any], summary: Mapping[str, Any]) -> str:
+    """Return the content of results.csv-metadata.json: name, unit and meaning of each column.
+
+    It is a file of its own, because a comment above the header would stop readers of CSV. Source:
+    W3C, Metadata Vocabulary for Tabular Data (2015), section 5.
+
+    Args:
+        columns: columns of results.csv.
+        summary: content of summary.json.
+    """
+    meanings = {one.name: one.meaning for one in COLUMNS}
+    rows = []
+    for name in columns:
+        family = next((one for one in FAMILIES if belongs(name, one)), name)
+        rows.append(
+            {
+                "titles": name,
+                "dc:description": meanings.get(name, meanings.get(family, "")),
+                "schema:unitText": unit_of(name),
+                "datatype": DATATYPES.get(KINDS.get(name, "number"), "number"),
+            }
+        )
+    content = {
+        "@context": ["http://www.w3.org/ns/csvw", {"@language": "en"}],
+        "url": "results.csv",
+        "dc:creator": f"tkamb {summary.get('versions', {}).get('tkamb', __version__)}",
+        "dc:license": summary.get("licence") or "not stated",
+        "dc:source": f"scene SHA-256 {summary.get('scene_sha256')}",
+        "dialect": {"header": True, "delimiter": ",", "encoding": "utf-8"},
+        "tableSchema": {"columns": rows},
+    }
+    return json.dumps(content, indent=1, ensure_ascii=False) + "\n"

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from tkamb.knee.slip import CondyleSlip
 
 
-# 1: number of earlier contacts that are stored as initial guesses. Chosen because older ones are
+# 1: number of earlier contacts that are stored as initial guesses. Older ones are
 # no better than a new search.
 KEPT_CONTACTS = 20
 # 1: successive frames that a worker computes. The first has no initial guess from an earlier
@@ -50,12 +50,10 @@ class FrameSolver:
     """Computes the frames of a case.
 
     Args:
-        case: scene with its files read.
         frames: frames to compute; None: all.
         slips: slips from another solver of this case; None: they are computed.
 
     Attributes:
-        recording: knee and motion of the case.
         slips: side -> rolling and slip of a condyle in the recorded motion.
         before: starts of earlier frames, the initial guesses for the next frame.
 
@@ -98,7 +96,6 @@ Chunk = tuple[list[int], "dict[str, CondyleSlip]"]
 
 @contextmanager
 def _without_warnings() -> Iterator[None]:
-    """Print no warnings in a worker, since the parent process prints the same warnings."""
     log = logging.getLogger("tkamb")
     level = log.level
     log.setLevel(logging.ERROR)
@@ -269,7 +266,6 @@ class _Run:
             self.seconds["prepare contact"] = clock.perf_counter() - start
 
     def compute(self, recorder: Recorder, progress: Progress, team: WorkerPool | None) -> Results:
-        """Compute the remaining frames and return the results."""
         self.recorder = recorder
         knee = self.solver.recording.knee
         if knee.contact is not None:
@@ -370,7 +366,6 @@ def _dotted(overrides: Mapping[str, Any], tables: Mapping[str, Any]) -> dict[str
 
 
 def _scene_with(scene: Scene | Case, overrides: dict[str, Any]) -> Scene:
-    """Return the scene with overrides."""
     if isinstance(scene, Case):
         raise InputError("a case has been read already", "overrides", "give its scene instead")
     return with_overrides(scene, overrides)
@@ -387,7 +382,6 @@ def _scene_as(
 
 
 def _case_with_contact(scene: Scene | Case, model: str | None, resolution_mm: float | None) -> Case:
-    """Return the case of a scene, with another contact model or resolution if given."""
     changes = {"model": model, "resolution_mm": resolution_mm}
     changes = {key: value for key, value in changes.items() if value is not None}
     if isinstance(scene, Case):

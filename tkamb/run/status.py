@@ -25,19 +25,19 @@ class AgreementSettings:
     """Limits for a contradiction of two estimates."""
 
     share_difference: float = 0.25
-    """1: largest difference of the two medial shares without a flag. Chosen because smaller
+    """1: largest difference of the two medial shares without a flag. Smaller
     differences are within the errors of both."""
     large_residual_share: float = 0.10
     """1: largest AP and ML residual without a flag, as a share of the superior-inferior contact
-    force. Chosen because smaller residuals are within the errors of the forces."""
+    force. Smaller residuals are within the errors of the forces."""
     unloaded_share: float = 0.01
-    """1: share of the load below which a condyle counts as unloaded. Chosen because the errors of
+    """1: share of the load below which a condyle counts as unloaded. The errors of
     the split are larger."""
     adduction_error: float = 0.5 * DEGREE
     """rad: error of adduction from fluoroscopy, 0.5 deg."""
     moved_load_share: float = 0.25
     """1: largest share of the load that the error of adduction may shift between condyles. Above
-    it, the recorded pose does not determine the split. Chosen because a quarter may decide which
+    it, the recorded pose does not determine the split. A quarter may decide which
     condyle carries more."""
 
 
@@ -121,20 +121,20 @@ class StatusSettings:
     """Limits beyond which a frame's status carries a flag."""
 
     filter_translation: float = 0.5 * MILLIMETRE
-    """m: largest translation of a recorded pose by the filter without a flag. Chosen because the
+    """m: largest translation of a recorded pose by the filter without a flag. The
     error of fluoroscopy is smaller."""
     filter_rotation: float = 0.5 * DEGREE
-    """rad: largest rotation of a recorded pose by the filter without a flag, 0.5 deg. Chosen
-    because the error of fluoroscopy is smaller."""
+    """rad: largest rotation of a recorded pose by the filter without a flag, 0.5 deg.
+    The error of fluoroscopy is smaller."""
     flank_angle: float = 20.0 * DEGREE
     """rad: largest angle of a condyle's contact normal from the vertical without a flag, 20 deg.
-    Chosen because steeper contact is on eminence or lip."""
+    Steeper contact is on eminence or lip."""
     adjusted_total_BW: float = 0.01
-    """BW: largest change of the total force by the femoral adjustment without a flag. Chosen
-    because the adjustment should change the split only."""
+    """BW: largest change of the total force by the femoral adjustment without a flag.
+    The adjustment should change the split only."""
     marker_distance: float = 20.0 * MILLIMETRE
     """m: largest distance between the knee centres of shank and thigh markers without a flag.
-    Chosen because it causes 14 N·m at 700 N."""
+    It causes 14 N·m at 700 N."""
 
 
 STATUS = StatusSettings()
@@ -158,9 +158,6 @@ def frame_status(
     """Return "ok", or reasons joined by "; ". The status of a failed frame begins with "failed".
 
     Args:
-        case: the case.
-        k: index of the frame.
-        frame: loads and contact of the frame.
         question_flags: flags of the questions on the frame (`tkamb.run.plausibility`).
     """
     words = [*_motion_flags(case, k), *_flank_flags(frame), *_adjustment_flags(case, frame)]

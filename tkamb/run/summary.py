@@ -43,11 +43,11 @@ RESIDUALS = (
 )
 
 
-# 1: share of a coordinate's largest moment above which a reserve is counted as large. Chosen
-# because smaller reserves hardly change muscle forces.
+# 1: share of a coordinate's largest moment above which a reserve is counted as large.
+# Smaller reserves hardly change muscle forces.
 NOTABLE_RESERVE = 0.05
 # 1: largest relative difference between longest and shortest time step of a motion with a frame
-# rate. Chosen because clocks and rounding cause smaller differences.
+# rate. Clocks and rounding cause smaller differences.
 UNEVEN_SHARE = 0.01
 
 
@@ -67,7 +67,6 @@ def summary_of(
     """Return the content of summary.json (docs/results.md).
 
     Args:
-        case: the case.
         columns: columns of results.csv.
         seconds: part of the computation -> computing time, s.
         path: path of the scene file; None: the scene is not from a file.
@@ -185,7 +184,6 @@ def _tolerances(table: ContactTable) -> dict[str, float]:
 
 
 def _gait(case: Case) -> dict[str, Any]:
-    """Return gait events and stances from the force plates, and the gait cycle."""
     inputs: dict[str, Any] = {}
     cycle = case.gait_cycle_s
     if cycle is None and case.motion.cycle_percent is None and case.scene.output.axis == "cycle":
@@ -253,7 +251,6 @@ def _subject(case: Case) -> dict[str, Any]:
 
 
 def _counts(columns: dict[str, Any]) -> dict[str, Any]:
-    """Return number of frames, failed and flagged frames, and largest force."""
     statuses, times = columns["status"], columns["time_s"]
     return {
         "frames": len(statuses),

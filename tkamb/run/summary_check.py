@@ -284,7 +284,6 @@ def check_summary(summary: object, path: object) -> None:
 
     Args:
         summary: content of a summary.json.
-        path: path of the file, for the message.
 
     Raises:
         InputError: a value has another kind, or is missing.

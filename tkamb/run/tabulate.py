@@ -38,11 +38,11 @@ if TYPE_CHECKING:
     from tkamb.contact.cam_post import PostContact
     from tkamb.io.recordings.marker_motion import MarkerKinematics
     from tkamb.knee.button import ButtonPress
-    from tkamb.knee.contact_points import CondylePoint
     from tkamb.knee.crossing import MuscleShare
     from tkamb.knee.frame import Frame
     from tkamb.knee.patella_equilibrium import FoundPatella
     from tkamb.knee.slip import CondyleSlip
+    from tkamb.knee.unknowns import CondylePoint
 
 NAN = float("nan")
 WHY_IT_FAILED = (
@@ -66,9 +66,6 @@ def frame_row(
     A failed frame has numbers only for its motion and `WHY_IT_FAILED`.
 
     Args:
-        case: the case.
-        k: index of the frame.
-        frame: loads and contact of the frame.
         slips: side -> slip in the frames up to k + 1, see `Recording.slips`.
         status: status of the frame.
     """
@@ -218,7 +215,6 @@ def _body_row(case: Case, frame: "Frame") -> dict[str, float]:
 
 
 def _muscle_row(share: "MuscleShare") -> dict[str, float]:
-    """Return forces and activations of the muscles, joint moments and reserves."""
     row: dict[str, float] = {}
     for family, names, values in (
         (MUSCLE_FORCE, share.muscles, share.force),
@@ -274,7 +270,6 @@ def _contact_row(frame: "Frame", yield_stress: float) -> dict[str, float]:
 
 
 def _post_row(post: "PostContact") -> dict[str, float]:
-    """Return force, pressure and gap of cam and post."""
     force, centre, factor = post.force, post.centre, NAN if post.problem else 1.0
     return {
         "post_force_N": float(np.linalg.norm(force)),
@@ -332,7 +327,6 @@ def _patella_row(case: Case, found: "FoundPatella | None") -> dict[str, float]:
 
 
 def _pose_row(frame: "Frame") -> dict[str, float]:
-    """Return the pose of the contact, and the convergence of the coupling."""
     place = knee_coordinates(frame.contact.pose) if frame.contact else np.full(6, NAN)
     named = dict(zip(KNEE_COORDINATES, place.tolist(), strict=True))
     row = {f"{axis}_mm": named[axis] / MILLIMETRE for axis in ("ap", "si", "ml")}

@@ -98,7 +98,6 @@ class Profile:
         """Return times, files, modules and libraries of the run as a JSON object.
 
         Args:
-            results: results of the run.
             scene: path of the scene file. Only opened files in its folder and files that the scene
                 names are listed.
         """

@@ -36,10 +36,10 @@ class ClusterSettings:
     """Limits for a Dask cluster."""
 
     answer_seconds: float = 10.0
-    """s: time limit for the answer of a scheduler. Chosen because an idle scheduler answers within
+    """s: time limit for the answer of a scheduler. An idle scheduler answers within
     one second."""
     most_deaths: int = 5
-    """1: workers that may die in one job before the run fails. Chosen because the job is then the
+    """1: workers that may die in one job before the run fails. The job is then the
     likely cause."""
 
 
@@ -66,7 +66,6 @@ def _library() -> Any:
 
 
 def _connected(distributed: Any, address: str) -> Any:
-    """Return a client of the scheduler."""
     try:
         return distributed.Client(address, timeout=CLUSTER.answer_seconds)
     except (OSError, ValueError, TypeError) as error:  # no answer, or an invalid address
@@ -114,7 +113,6 @@ def answer(packed: bytes, number: int, job: Any) -> Any:
     Args:
         packed: pickled `make` and `arguments` of a `Task`.
         number: number of the job.
-        job: content of the job.
     """
     with _one_at_a_time:
         return _unpacked(packed)(number, job)
@@ -127,7 +125,7 @@ def _unpacked(packed: bytes) -> Callable[[int, Any], Any]:
     return prepared
 
 
-# 1: largest number of worker processes. Chosen because usual machines have fewer cores.
+# 1: largest number of worker processes. Usual machines have fewer cores.
 MAX_WORKERS = 256
 
 
@@ -204,7 +202,6 @@ class PoolOptions:
 
         Args:
             task: task of the workers.
-            count: largest number of jobs.
         """
         processes = self.dask is None and self.workers > 1 and count > 1
         team = WorkerPool(self, task, min(self.workers, count) if processes else 0)
@@ -243,7 +240,6 @@ class WorkerPool:
         self._free.put(process)
 
     def _answer(self, job: Numbered) -> Numbered:
-        """Return number and answer of a job from the next free worker."""
         process = self._free.get()
         assert process.stdin is not None and process.stdout is not None
         try:
@@ -322,7 +318,6 @@ def serve() -> None:
 
 
 def _answer(work: Callable[[int, Any], Any], number: int, job: Any) -> Numbered | TkambError:
-    """Return number and answer of a job, or the error, which the parent raises."""
     try:
         return number, work(number, job)
     except Exception as error:

@@ -43,9 +43,9 @@ AT_ONCE = len(COLOURS)
 """Largest number of groups in one plot."""
 
 
-# Largest number of pressure maps. Chosen because more make the page slow to open.
+# Largest number of pressure maps. More make the page slow to open.
 MOST_MAPS = 24
-# Largest number of failed runs in the list. Chosen because the page stays readable.
+# Largest number of failed runs in the list. The page stays readable.
 MOST_FAILED = 100
 
 
@@ -82,7 +82,6 @@ def _designs(
 
 
 def _error_card(cohort: Cohort, outcomes: Mapping[int, Outcome]) -> Card | None:
-    """Return the known error of the cohort's contact models; None without contact."""
     words: dict[str, str] = {}
     large = False
     for n, outcome in outcomes.items():
@@ -187,7 +186,6 @@ def _wear_card(outcomes: Mapping[int, Outcome], groups: Sequence[Group]) -> Card
 
 
 def _wear_table(groups: Sequence[Group]) -> dict[str, Any] | None:
-    """Return a row per group: worn volume, its range, depth, and initial wear rate by each law."""
     groups = [group for group in groups if "volume_mm3_per_Mc" in group.wear]
     if not groups:
         return None
@@ -204,7 +202,6 @@ def _wear_table(groups: Sequence[Group]) -> dict[str, Any] | None:
 
 
 def _row(group: Group, names: Sequence[str]) -> list[str]:
-    """Return a group's row of the table: numbers of runs and of failed runs, and the peaks."""
     cells = [group.name, str(len(group.numbers)), str(group.failed or "")]
     for name in names:
         over = spread(group.peaks.get(name, np.array([np.nan]))[:, None])
@@ -394,7 +391,6 @@ def _caption(cohort: Cohort, outcome: Outcome, group: Group, number: int) -> str
 
 
 def _failed(cohort: Cohort, outcomes: Mapping[int, Outcome]) -> list[tuple[str, str, str]]:
-    """Return number, labels and reason of the runs that failed."""
     return [
         (str(n), cohort.runs[n].words(), one.reason) for n, one in outcomes.items() if one.reason
     ]

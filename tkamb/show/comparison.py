@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 # deg, per cent or s: frames with a smaller distance on the axis are the same instant of one
-# recording. Chosen because it is above the rounding of files.
+# recording. It is above the rounding of files.
 TOLERANCE = 1e-6
 
 
@@ -112,7 +112,7 @@ VERSIONS = "identity"
 SAME = "Nothing differs: settings, input files, versions and code of the runs agree."
 
 
-# Largest number of runs in a picture. Chosen because more colours are hard to distinguish.
+# Largest number of runs in a picture. More colours are hard to distinguish.
 MAX_RUNS = 8
 
 
@@ -122,8 +122,6 @@ class Run:
 
     Args:
         label: short name, unique among the runs.
-        folder: folder of the results.
-        results: results in the folder.
         axis: horizontal axis of its curves.
         pairing: pairing with the frames of the first run; None: frames cannot be paired.
     """

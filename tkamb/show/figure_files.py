@@ -26,10 +26,6 @@ def write_figures(results: "Results", folder: Path) -> list[str]:
     """Write every plot and map of a run in each of `FORMATS` and return the names without suffix.
 
     Each file holds the title, the unit, the licence of the results and the version of tkamb.
-
-    Args:
-        results: results of a run.
-        folder: existing folder.
     """
     names = []
     for name, words, figure in _figures(results, horizontal_axis(results)):

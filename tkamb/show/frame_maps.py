@@ -25,14 +25,14 @@ if TYPE_CHECKING:
     from tkamb.run.results import Results
 
 
-# Byte at the edge of contact; larger bytes are pressure. Chosen because it leaves bytes for the
+# Byte at the edge of contact; larger bytes are pressure. It leaves bytes for the
 # gaps outside contact, from which the page finds the edge between grid points.
 RIM_BYTE = 64
 # Largest number of maps in the page. A longer run shows the map of the nearest frame at each
-# position of the slider. Chosen because it limits the size of the page.
+# position of the slider. It limits the size of the page.
 MOST_FRAMES = 250
-# Grid step of the slider's maps divided by the grid step of the report's still maps. Chosen
-# because the data are a quarter of the size.
+# Grid step of the slider's maps divided by the grid step of the report's still maps.
+# The data are a quarter of the size.
 COARSENING = 2
 
 

@@ -28,14 +28,14 @@ AXIS_NAMES = {"ap": "AP", "si": "SI", "ml": "ML"}
 MOST_INPUTS = 2
 # Largest number of saturated muscles in a sentence. Not studied.
 MOST_MUSCLES = 4
-# 1: a larger share of failed samples is stated. Chosen because fewer failed samples hardly move
+# 1: a larger share of failed samples is stated. Fewer failed samples hardly move
 # the 5th or 95th percentile.
 NOTABLE_FAILED_SHARE = 0.05
-# % of the SI contact force: smaller residuals count as none. Chosen because they are within the
+# % of the SI contact force: smaller residuals count as none. They are within the
 # tolerance of the equilibrium.
 RESIDUAL_PERCENT = 0.05
 # deg: if the quadriceps begins to wrap between frames farther apart than this, the flexion of both
-# is stated. Chosen because readers need this flexion to a few degrees.
+# is stated. Readers need this flexion to a few degrees.
 DISTANT_FRAMES_DEG = 5.0
 
 
@@ -52,7 +52,6 @@ class Card:
     """One headline number.
 
     Args:
-        title: name of the number.
         value: the number with its unit.
         sentence: one sentence: place in the motion, or meaning of the number.
         more: further sentences, which the report unfolds.
@@ -314,7 +313,6 @@ def _wraps_from(results: "Results", first: float) -> str:
     """Return in words the flexion at which the quadriceps begins to wrap the femur.
 
     Args:
-        results: results of a run.
         first: smallest flexion of a frame in which it wraps, deg.
     """
     flexion, wrap = results["flexion_deg"], results["quadriceps_wrap_deg"]

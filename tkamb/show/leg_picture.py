@@ -36,11 +36,11 @@ from tkamb.show.style import (
 )  # fmt: skip
 from tkamb.units import DEGREE, MILLIMETRE
 
-# m per body weight: length of the force arrow. Chosen because it fits beside the leg.
+# m per body weight: length of the force arrow. It fits beside the leg.
 ARROW_METRES_PER_BW = 0.35
-# m: half width of the picture of the knee. Chosen because a total knee fits.
+# m: half width of the picture of the knee. A total knee fits.
 KNEE_HALF_WIDTH = 0.085
-# m: margin around the leg or knee. Chosen because labels fit.
+# m: margin around the leg or knee. Labels fit.
 MARGIN = 0.08
 
 
@@ -217,7 +217,6 @@ def _caption(case: Case, one: LegFrame) -> str:
 
 
 def _draw(axes: Axes, one: LegFrame, view: View, weight: float) -> None:
-    """Draw implant, joint centres, lines of action and ground reaction of one frame."""
     joints = view.page(one.joints)
     axes.plot(*joints.T, color=BLACK, linewidth=3, alpha=0.35, solid_capstyle="round")
     axes.plot(*joints.T, "o", color=BLACK, markersize=4)
@@ -262,7 +261,6 @@ def _name_sides(axes: Axes, view: View) -> None:
 
 
 def _name_ligaments(axes: Axes, one: LegFrame, view: View) -> None:
-    """Write each ligament's name beside the middle of its first strand."""
     for points, _, name in one.lines:
         if name:
             x, y = view.page(points.mean(axis=0))
@@ -289,7 +287,6 @@ def _draw_surface(axes: Axes, surface: Surface, view: View, colour: str) -> None
 
 
 def _close_up(axes: Axes, one: LegFrame, view: View) -> None:
-    """Limit the axes to the knee."""
     centre = view.page(one.joints[1]) + np.array([0.0, 15 * MILLIMETRE])
     axes.set_xlim(centre[0] - KNEE_HALF_WIDTH, centre[0] + KNEE_HALF_WIDTH)
     axes.set_ylim(centre[1] - KNEE_HALF_WIDTH, centre[1] + KNEE_HALF_WIDTH)

@@ -9,13 +9,13 @@ from tkamb.geometry.frames import Array, Mask
 from tkamb.geometry.topology import counted
 from tkamb.units import MILLIMETRE
 
-# 1: a grid point belongs to a triangle if no barycentric coordinate is below minus this. Chosen
-# because it is above rounding.
+# 1: a grid point belongs to a triangle if no barycentric coordinate is below minus this.
+# It is above rounding.
 EDGE_TOLERANCE = 1e-9
-# m: upper limit of gaps, also of infinite ones. Chosen because it is far above the gaps beside a
+# m: upper limit of gaps, also of infinite ones. It is far above the gaps beside a
 # contact.
 LARGEST_GAP = 10 * MILLIMETRE
-# Number of grid points around the contacts. Chosen because the edge of contact is then drawn
+# Number of grid points around the contacts. The edge of contact is then drawn
 # whole.
 MARGIN_POINTS = 2
 

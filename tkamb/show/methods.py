@@ -15,7 +15,7 @@ from tkamb.run import texts
 from tkamb.run.claims import compared_forces, method_error
 from tkamb.run.columns import WITHOUT_MUSCLES
 
-# Largest number of characters in a line. Chosen because terminals show it without breaks.
+# Largest number of characters in a line. Terminals show it without breaks.
 LINE_WIDTH = 92
 
 
@@ -89,7 +89,6 @@ class Methods:
     """A Methods paragraph.
 
     Args:
-        sentences: sentences of the paragraph.
         references: cited publications, sorted.
     """
 
@@ -168,7 +167,6 @@ def _laws(tables: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
 
 
 def _generic_bundles(tables: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the bundles of [generic_ligaments]."""
     chosen = (tables.get("generic_ligaments") or {}).get("ligaments") or ()
     if not chosen:
         return {}

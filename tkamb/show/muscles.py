@@ -53,7 +53,7 @@ HELD = (
 )
 
 
-# 1: upper end of the axis of activations. Chosen because lines at 1 stay visible.
+# 1: upper end of the axis of activations. Lines at 1 stay visible.
 AXIS_TOP = 1.02
 
 

@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from tkamb.run.results import Results
 
 
-# 1: two curves coincide if their largest distance is below this share of their height. Chosen
-# because a line is about 1.5 points wide in a plot of 220 points.
+# 1: two curves coincide if their largest distance is below this share of their height.
+# A line is about 1.5 points wide in a plot of 220 points.
 LINE_WIDTH_SHARE = 0.005
 
 
@@ -115,7 +115,6 @@ def _without_empty_lines(panel: Panel) -> Panel:
 
 
 def _none_hidden(lines: Sequence[Line]) -> tuple[Line, ...]:
-    """Return the lines. A line that would hide an earlier one is dashed."""
     shown: list[Line] = []
     for line in lines:
         covers = any(_coincide(line.values, earlier.values) for earlier in shown)

@@ -70,7 +70,6 @@ class Sheet:
     `_place_alone` cannot place has a separate figure.
 
     Args:
-        results: results of the run.
         axis: horizontal axis of every plot.
         width: width of the figure, inches.
     """
@@ -220,7 +219,6 @@ def mark_frames(axes: Axes, results: "Results", axis: HorizontalAxis) -> None:
 
 
 def _draw_stances(axes: Axes, axis: HorizontalAxis) -> None:
-    """Shade the stances of gait behind the curves."""
     for on, off in axis.stances:
         axes.axvspan(on, off, facecolor=STANCE, edgecolor="none", zorder=0.2, gid="stance")
 
@@ -250,7 +248,6 @@ def _draw_band(axes: Axes, line: Line, axis: HorizontalAxis) -> None:
 
 
 def _legend_columns(panel: Panel) -> int:
-    """Return the number of columns of the legend."""
     return 2 if sum(len(line.label) + 6 for line in panel.lines) > 72 else 4
 
 

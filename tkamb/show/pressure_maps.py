@@ -33,16 +33,16 @@ if TYPE_CHECKING:
 
 # mm: margin around the insert in a picture. Chosen by eye.
 MARGIN_MM = 2.0
-# mm: spacing of the grid on which pressures are drawn. Chosen because steps are then invisible.
+# mm: spacing of the grid on which pressures are drawn. Steps are then invisible.
 STEP_MM = 0.3
 # 1: share of the scale over which a map with small gradients fades at its rim. A steeper map fades
-# over one spacing of the grid. Chosen because steps are then invisible.
+# over one spacing of the grid. Steps are then invisible.
 RIM_SHARE = 0.03
-# Number of grid points around the insert within which its smooth outline lies. Chosen because
-# smoothing moves the outline by less.
+# Number of grid points around the insert within which its smooth outline lies.
+# Smoothing moves the outline by less.
 OUTLINE_MARGIN = 8
 # 1: standard deviation of the filter that smooths the outline, as a share of the map's edge
-# length. Chosen because 0.5 leaves steps visible and 1 rounds the notch.
+# length. 0.5 leaves steps visible and 1 rounds the notch.
 OUTLINE_WIDTH = 0.7
 
 

@@ -30,7 +30,6 @@ def draw_registration(
     one standard deviation in each direction. On the right the residuals of the rigid fits.
 
     Args:
-        links: links of the leg.
         model: segments with the model's markers.
         found: the registration of these segments.
     """

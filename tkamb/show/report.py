@@ -81,7 +81,6 @@ def report_html(results: "Results", progress: Progress = lambda drawn: drawn) ->
     """Return the report as a self-contained HTML page.
 
     Args:
-        results: results of a run.
         progress: function that wraps the plots, for example a progress bar.
     """
     axis, shown = horizontal_axis(results), shown_frames(results)
@@ -150,7 +149,6 @@ def _contact_words(contact: dict[str, Any], material: dict[str, Any]) -> str:
 
 
 def _maps(results: "Results", axis: HorizontalAxis, sheet: Sheet) -> dict[str, Any] | None:
-    """Return the pictures of pressure on the insert; None without maps."""
     view, frames = top_view(results), mapped_frames(results, axis)
     if view is None or not frames:
         return None
@@ -172,7 +170,6 @@ def _button(results: "Results", axis: HorizontalAxis) -> str | None:
 
 
 def _muscles(results: "Results", axis: HorizontalAxis) -> dict[str, Any] | None:
-    """Return the section on muscles; None without [muscles]."""
     if not results.summary.get("muscle_groups"):
         return None
     from tkamb.show.muscles import HELD, draw_activations, muscle_panels, reserve_words

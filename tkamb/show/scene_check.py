@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 ANGLES = ("flexion", "adduction", "axial_rotation")
 
 
-# 1: ligament bundles with a larger strain are listed. Chosen because ligaments of the knee rupture
+# 1: ligament bundles with a larger strain are listed. Ligaments of the knee rupture
 # at 12 to 20 %.
 HIGH_STRAIN = 0.1
 
@@ -129,7 +129,6 @@ def _in_words(case: Case) -> str:
 
 
 def _shank(case: Case) -> Entry:
-    """Return the forward lean of the tibia's long axis and the height of the ankle."""
     if case.tibia is None:
         raise ValueError("a shank that was read has a motion")
     up = case.tibia.pose[:, :3, 1]
@@ -221,7 +220,6 @@ def _contact(case: Case) -> Entry:
 
 
 def _measured(measured: "MeasuredForce", weight: float) -> Entry:
-    """Return the forces that an instrumented implant measured."""
     forces = [
         _range(name, values[np.isfinite(values)] / weight, "BW", 2)
         for name, values in measured.force.items()
@@ -247,12 +245,8 @@ class SceneCheck:
     """Content of a scene, parts that are not modelled, and questions.
 
     Args:
-        scene: path of the scene file.
-        case: content of the scene and its files.
-        recording: knee and motion of the case.
         entries: content of each file and table.
         not_modelled: names of parts that the scene leaves out.
-        assumptions: assumptions of the results.
         questions: unlikely values, with the likely mistake.
         answered: lines on questions that the scene answers.
         missing: messages on packages that a run needs and that are not installed.
@@ -312,7 +306,6 @@ def check_scene(
     Meshes are not checked for use by the contact model. Only a run does this.
 
     Args:
-        path: path of the scene file.
         overrides: dotted scene key -> value, see `tkamb.load_scene`.
         begin: function that is called with the name of each stage.
 
@@ -352,7 +345,6 @@ def _missing(case: Case) -> tuple[str, ...]:
 
 
 def _beyond(case: Case) -> list[str]:
-    """Return further parts of the knee that this scene does not model."""
     muscles = [] if case.scene.muscles else ["muscles other than the quadriceps"]
     patella = ["out-of-plane motion of the patella"] if case.scene.patella else []
     post = [] if case.post is not None else ["cam–post contact"]

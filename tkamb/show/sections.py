@@ -224,7 +224,7 @@ STRETCHES_SHOWN = 60
 WEAR_NAME, PICTURE_NAME, WORN_NAME = "wear.json", "wear.png", "wear.vtp"
 
 
-# Bytes: largest size of a file. Chosen because the file of 10,000 updates has 10 MB.
+# Bytes: largest size of a file. The file of 10,000 updates has 10 MB.
 MAX_BYTES = 64 * MEGABYTE
 
 

@@ -23,7 +23,6 @@ def write_storage(path: Path, columns: Mapping[str, Array], in_degrees: bool) ->
     """Write a `.sto` or `.mot` table.
 
     Args:
-        path: path of the file.
         columns: name -> (n,) values. The first is "time", s.
         in_degrees: whether the header states degrees.
 
@@ -59,7 +58,6 @@ def write_results_storage(results: "Results", path: Path) -> str:
     frame to be read with care, 2 a failed frame.
 
     Args:
-        results: results of a run.
         path: path of a new file, .sto or .mot.
 
     Returns:
@@ -92,7 +90,6 @@ def write_trc(path: Path, time: Array, markers: Mapping[str, Array], rate_Hz: fl
     """Write markers as a `.trc` file in millimetres. A missing position has empty cells.
 
     Args:
-        path: path of the file.
         time: (n,) s, times of the rows.
         markers: label -> (n, 3) positions, m; NaN where missing.
         rate_Hz: sampling rate of the recording, Hz.

@@ -16,12 +16,12 @@ from tkamb.studies.tradeoff import EQUAL_RATIO, FRONT_ERRORS, KEYS, Row
 MARKERS = "osD^vPX*<>"
 
 
-# mm: cell size that is not written beside its point. Chosen because most points have it.
+# mm: cell size that is not written beside its point. Most points have it.
 UNLABELLED_MM = 2.0
 # 1: a logarithmic axis also has labels within its decades if the ratio of its two ends is smaller
-# than this. Chosen because on longer axes the labels of the decades are enough.
+# than this. On longer axes the labels of the decades are enough.
 SHORT_AXIS_RATIO = 30.0
-# Smallest number of different pairs of bodies that gives a recommendation. Chosen because the two
+# Smallest number of different pairs of bodies that gives a recommendation. The two
 # pairs of the quick study suit `hertz`, whose errors on a knee are larger.
 MIN_BODIES = 3
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from tkamb.run.results import Results
 
 
-# Recorded frames from one compared frame to the next. Chosen because every frame rate of the study
+# Recorded frames from one compared frame to the next. Every frame rate of the study
 # contains these frames.
 STRIDE = 10
 

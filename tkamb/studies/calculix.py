@@ -41,10 +41,10 @@ from tkamb.units import MEGAPASCAL, MILLIMETRE
 PROGRAM = "ccx"
 
 
-# s: time limit of a run. A longer run is stopped and has no result. Chosen because most runs take
+# s: time limit of a run. A longer run is stopped and has no result. Most runs take
 # less than a minute.
 LONGEST_SECONDS = 600.0
-# s: interval between two readings of the memory of the process. Chosen because it is short
+# s: interval between two readings of the memory of the process. It is short
 # compared with a run and costs little.
 POLL_SECONDS = 0.05
 
@@ -109,7 +109,6 @@ def run_calculix(text: str, longest: float = LONGEST_SECONDS) -> PeerRun:
 
 
 def _wait(command: list[str], place: Path, longest: float) -> float:
-    """Run a command to its end with one thread and return its peak memory, MB."""
     memory, start = math.nan, clock.perf_counter()
     with (
         open(place / OUTPUT_FILE, "wb") as output,
@@ -161,8 +160,8 @@ def _blocks(lines: Iterable[str]) -> dict[str, Array]:
     return {name: np.array(rows) for name, rows in blocks.items() if rows}
 
 
-# Largest difference between the summed contact forces and the load, relative to the load. Chosen
-# because converged solutions differ by less.
+# Largest difference between the summed contact forces and the load, relative to the load.
+# Converged solutions differ by less.
 MAX_RESIDUAL = 0.01
 
 
@@ -224,7 +223,6 @@ def press_by_calculix(
     """Press a femoral component on an insert with CalculiX.
 
     Args:
-        pair: the two bodies.
         load: force along -y, N.
         pose: pose_femoral_in_insert, shape (4, 4); its y has no effect.
         grid_mm: edge length of the hexahedra, mm.

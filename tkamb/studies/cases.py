@@ -151,9 +151,7 @@ class StudyCase:
     """One contact problem.
 
     Args:
-        name: name of the case.
         label: description in one line.
-        pair: the two bodies.
         pose: pose_femoral_in_insert, shape (4, 4); its y has no effect.
         load: force along -y, N.
         sphere: dimensions, if the case is a sphere on a linear layer.

@@ -46,9 +46,9 @@ CURVE = {"alpha": 0.0389, "reference_stress": 8.4194 * MEGAPASCAL, "exponent": 4
 """Published Ramberg-Osgood parameters of the polyethylene of these cases (`docs/contact.md`)."""
 
 
-# mm: side of the block under the plate. Chosen because cells of 2 and 3 mm divide it.
+# mm: side of the block under the plate. Cells of 2 and 3 mm divide it.
 BLOCK_SIDE_MM = 24.0
-# mm: cell size of the "kept" cases. Chosen because the cache does not store the smaller operators
+# mm: cell size of the "kept" cases. The cache does not store the smaller operators
 # of larger cells.
 KEPT_GRID_MM = 0.9
 # Approach of the plate on Sharma's springs over its approach on the elastic solid. The springs
@@ -74,7 +74,6 @@ class ClosedForm:
 
     Args:
         kind: "plate", "slide", "kept", "layer", "bed" or "hertz".
-        model: name of the contact model.
         load_N: force along -y, N.
         thickness_mm: height of the block, mm.
         modulus_MPa: Young's modulus, MPa.
@@ -135,7 +134,8 @@ def press_closed_form(case: ClosedForm) -> tuple[ContactResult, ContactPair]:
         ComputationError: the cache does not contain one operator for each modulus.
     """
     pair = case.pair
-    options = {"cache": case.kind == "kept"} if _has_cache(case.model) else {}
+    fields = getattr(contact_class(case.model), "__dataclass_fields__", {})
+    options = {"cache": case.kind == "kept"} if "cache" in fields else {}
     model = contact_model(case.model, resolution=case.resolution_mm * MILLIMETRE, **options)
     if case.kind != "kept":
         return model.press(model.prepare(pair), case.load_N, np.eye(4)), pair
@@ -278,7 +278,3 @@ def _inner(result: ContactResult) -> Mask:
 def _plate(side: float) -> Surface:
     box = block(flat(10 * MILLIMETRE), (side, side), side / 2)
     return Surface(box.vertices, box.faces, "plate")
-
-
-def _has_cache(name: str) -> bool:
-    return "cache" in getattr(contact_class(name), "__dataclass_fields__", {})

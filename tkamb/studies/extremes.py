@@ -33,7 +33,6 @@ class Extreme:
     Args:
         load_N: force along -y, N.
         thickness_mm: thickness of the insert under the lowest points of the dishes.
-        resolution_mm: cell size.
         aspect: length of the insert along x, relative to the base case.
         nu: Poisson's ratio of the insert.
         modulus_MPa: Young's modulus of the insert, MPa.
@@ -44,14 +43,10 @@ class Extreme:
         apart_mm: half the distance between the condyles; 0: a single condyle.
         ap_mm: anterior position of the femoral component.
         ml_mm: lateral position of the femoral component.
-        varus_deg: adduction.
-        flexion_deg: flexion.
-        axial_deg: axial rotation.
         bearing: "fixed" or "mobile".
         rough_mm: standard deviation of the noise on the femoral vertices.
         facet_deg: angle between the rings of femoral vertices.
         shape: shape of the bodies, see `Shape`.
-        model: name of the contact model.
     """
 
     load_N: float = 1500.0

@@ -114,15 +114,15 @@ def map_error(raster: Raster, reference: Raster) -> float:
     return float(np.linalg.norm(computed - true) / np.linalg.norm(true))
 
 
-# s: time limit of a job. A longer job is stopped and has no result. Chosen because the study
+# s: time limit of a job. A longer job is stopped and has no result. The study
 # should take minutes.
 LONGEST_SECONDS = 300.0
 # Largest number of timed preparations and first presses, and smallest number of timed warm
-# presses. Chosen because the median of three ignores one slow press.
+# presses. The median of three ignores one slow press.
 REPEATS = 3
-# Largest number of timed warm presses. Chosen because their median ignores slow ones.
+# Largest number of timed warm presses. Their median ignores slow ones.
 WARM_PRESSES = 7
-# s: measured time after which only warm presses are repeated, up to `REPEATS`. Chosen because the
+# s: measured time after which only warm presses are repeated, up to `REPEATS`. The
 # study should take minutes.
 ENOUGH_SECONDS = 3.0
 
@@ -149,10 +149,7 @@ class Job:
     """A contact model and a case to measure.
 
     Args:
-        case: name of the case.
-        contact: name of the contact model.
         resolution_mm: spacing of the model's map points, mm.
-        options: options of the model.
         scene: path of a user's scene, for the cases of that scene.
     """
 

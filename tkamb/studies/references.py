@@ -46,7 +46,7 @@ from tkamb.units import MILLIMETRE
 
 # Rings of constant pressure under the sphere. Not studied.
 RINGS = 160
-# Wave number times thickness above which the layer is treated as a half-space. Chosen because the
+# Wave number times thickness above which the layer is treated as a half-space. The
 # difference is below round-off.
 HALF_SPACE_WAVE_NUMBER = 60.0
 
@@ -133,10 +133,10 @@ GRIDS_MM = (1.5, 1.25, 1.0, 0.8)
 LARGE_GRIDS_MM = (2.0, 1.5, 1.25, 1.0)
 
 
-# m³: volume of the insert's bounding box above which coarser grids are used. Chosen because the
+# m³: volume of the insert's bounding box above which coarser grids are used. The
 # finest grid of such an insert does not fit into memory.
 LARGE_VOLUME = 2e-5
-# Relative tolerance of the reference solutions. Chosen far below the compared errors.
+# Relative tolerance of the reference solutions. Far below the compared errors.
 TOLERANCE = 1e-6
 # Relative difference between a block 3.4 times as wide as high and an infinite layer. Computed.
 WIDTH_EFFECT = 0.005
@@ -147,7 +147,6 @@ class Reference:
     """The reference solution of a case.
 
     Args:
-        hash: hash of the case.
         values: approach, m, and forces, N, pressures, Pa, and areas, m², of the condyles.
         uncertainty: uncertainty of each value, in the same unit.
         grids_mm: cell sizes of the solved grids, mm.

@@ -34,7 +34,7 @@ FRAMES = slice(20, 101, 40)
 TIME_SCALES = (1e-3, 1e-2, 0.1, 0.3, 3.0, 20.0, 1e4)
 
 
-# Duration of the slow motion over that of the recorded motion. Chosen because the inertia forces
+# Duration of the slow motion over that of the recorded motion. The inertia forces
 # are then 1 % of those of the recorded motion.
 SLOW_FACTOR = 10.0
 

@@ -31,20 +31,20 @@ class StabilitySettings:
     """Limits of the stability study."""
 
     longest_seconds: float = 120.0
-    """s: time limit of a model; a longer case is a hang. Chosen because usual cases take
+    """s: time limit of a model; a longer case is a hang. Usual cases take
     seconds."""
     longest_reference_seconds: float = 900.0
-    """s: time limit of a reference; a longer case is unverified. Chosen because the study should
+    """s: time limit of a reference; a longer case is unverified. The study should
     end within a day."""
     workers: int = 2
-    """Number of processes of the study. Chosen because a small computer has two cores."""
+    """Number of processes of the study. A small computer has two cores."""
     quick_share: int = 13
-    """Stride of the extreme cases that the quick study takes. Chosen because it should take
+    """Stride of the extreme cases that the quick study takes. It should take
     minutes."""
     quick_grid_mm: float = 3.0
-    """mm: smallest cell size of the quick study. Chosen because it should take minutes."""
+    """mm: smallest cell size of the quick study. It should take minutes."""
     quick_with_peer: int = 4
-    """Number of cases of the quick study with a stored result of CalculiX. Chosen because it should
+    """Number of cases of the quick study with a stored result of CalculiX. It should
     take minutes."""
 
 
@@ -85,13 +85,14 @@ def run_stability(
     """Judge all cases and yield their verdicts in the order of the cases.
 
     Args:
-        cases: the cases.
         longest: time limit of a case, s.
         kept: stored verdicts of earlier studies. They are not computed again; new ones are added.
         workers: number of cases that run at the same time.
     """
     judges, stored = _Judges(longest, kept), stored_verdicts()
-    pool = ThreadPoolExecutor(workers, initializer=_leave_interrupts_to_parent)
+    # Threads, and the processes that they start, leave Ctrl-C to this process, which stops them.
+    block = (signal.SIG_BLOCK, {signal.SIGINT})
+    pool = ThreadPoolExecutor(workers, initializer=signal.pthread_sigmask, initargs=block)
     try:
         for verdict in pool.map(judges.verdict, cases):
             yield replace(verdict, expected=stored.get(verdict.key))
@@ -134,7 +135,6 @@ class _Judges:
             ensure_running()
 
     def verdict(self, case: Case) -> Verdict:
-        """Return the verdict on a case, stored or new."""
         if self._kept is None:
             return self._judge_in_process(case)
         result = _kept_verdict(self._kept, case, self._longest)
@@ -144,11 +144,9 @@ class _Judges:
         return result
 
     def limit(self, case: Case) -> float:
-        """Return the time limit of a case, s."""
         return self._longest
 
     def stop(self) -> None:
-        """Kill the processes. Their cases get no verdict."""
         self._stopped = True
         for process in list(self._running):
             process.kill()
@@ -185,11 +183,6 @@ class _Judges:
             result = receiver.recv()
         verdict: Verdict = result
         return verdict
-
-
-def _leave_interrupts_to_parent() -> None:
-    """Block Ctrl-C in this thread and in the processes that it starts; the parent kills them."""
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
 
 
 def _send_verdict(case: Case, sender: Connection) -> None:

@@ -45,7 +45,7 @@ KEYS = ("approach", "force", "mean_pressure", "peak_pressure", "area", "map")
 TIMES = ("prepare_seconds", "cold_seconds", "warm_seconds", "peak_rss_MB")
 
 
-# Ratio of two median times below which they count as equal. Chosen because repeated measurements
+# Ratio of two median times below which they count as equal. Repeated measurements
 # vary by this factor.
 EQUAL_RATIO = 1.2
 
@@ -55,7 +55,6 @@ class Row:
     """Cost and errors of one model on one case.
 
     Args:
-        job: model and case.
         measure: times, memory and results.
         errors: name of `KEYS` -> error relative to the reference; empty if the job failed.
         floor: largest relative uncertainty of the reference among `FRONT_ERRORS`.
@@ -93,7 +92,6 @@ class Row:
 
 
 def _rounded(value: float) -> float | None:
-    """Return a number to six digits for JSON; None for NaN and inf."""
     return float(f"{value:.6g}") if math.isfinite(value) else None
 
 

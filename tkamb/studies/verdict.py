@@ -49,10 +49,10 @@ from tkamb.studies.extremes import Extreme
 from tkamb.studies.measures import Quantities, errors, quantities
 from tkamb.units import MILLIMETRE
 
-# Largest relative difference of forces and pressures from the load. Chosen as a few times the
+# Largest relative difference of forces and pressures from the load. A few times the
 # solver's tolerance.
 FORCE_TOLERANCE = 0.005
-# Largest penetration of a node into the femoral component over the approach. Chosen as a few times
+# Largest penetration of a node into the femoral component over the approach. A few times
 # the solver's tolerance.
 PENETRATION_TOLERANCE = 5e-3
 
@@ -139,7 +139,7 @@ def peer_distances(extreme: Extreme, result: ContactResult) -> dict[str, float]:
     return {name: differences[name] for name in PEER_BOUNDS}
 
 
-# Relative difference from the reference above which a result is wrong. Chosen below the published
+# Relative difference from the reference above which a result is wrong. Below the published
 # differences between models and experiments.
 MAX_ERROR = 0.02
 
@@ -159,7 +159,6 @@ class Verdict:
 
     Args:
         case: label of the case.
-        contact: name of the contact model.
         kind: one of `KINDS`.
         reason: reason of a verdict other than converged, or the flags of the result.
         error: largest relative difference from the reference; None without a comparison.
@@ -197,7 +196,6 @@ def judge(extreme: Extreme, pressed: Callable[[], None] = lambda: None) -> Verdi
     """Press an extreme case and compare the result with its reference.
 
     Args:
-        extreme: the case.
         pressed: function that is called between the model's result and the reference.
     """
     start = clock.perf_counter()

@@ -33,7 +33,7 @@ from tkamb.geometry.frames import Array, Index, displaced
 
 SURFACE_STEP = 1e-7
 """m: step of the central differences of the femoral surface; a rotation's step is this over
-`LEVER_ARM`. Chosen because it is far below the
+`LEVER_ARM`. It is far below the
 size of a facet, and rounding errors of the rays, about 1e-15 m, are 1e-8 of it."""
 
 LEVER_ARM = 0.03
@@ -46,7 +46,6 @@ def exact_force_changes(
     """Return the derivative (m, 3, 6) of nodal forces by a displacement of the femur.
 
     Args:
-        state: prepared contact.
         result: contact that has converged.
         start: its warm start.
         nodes: loaded contact nodes, shape (m,).

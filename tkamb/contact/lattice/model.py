@@ -373,9 +373,7 @@ def _start_after(
     """Return the warm start of a solution that has converged.
 
     Args:
-        state: prepared contact.
         contact: pose, pressure and gap of the solution.
-        solution: solution of the lattice.
         depth: travel of the femoral component since it touched the first contact node, m.
     """
     displacement = np.zeros_like(state.surface.points)

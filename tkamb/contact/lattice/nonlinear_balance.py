@@ -102,7 +102,6 @@ class NonlinearBalance:
     Args:
         problem: solid and operator.
         guess: response of the candidates; h, region and softening of an earlier solution.
-        settings: tolerances.
 
     Attributes:
         displacement: displacement of the candidates, m, shape (m, 3), from the compliance; after

@@ -13,20 +13,21 @@ stiffness only gives the direction of a search.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from tkamb.contact.lattice.initial_guess import LatticeStart, lattice_start
 from tkamb.contact.lattice.problem import ContactProblem, LatticeState
-from tkamb.contact.lattice.report import PressureRule
 from tkamb.contact.model import LoadedPoints, Probe, ProbedContact, condyle_wrenches
-from tkamb.contact.pressing import Presses
 from tkamb.contact.result import ContactResult, Guess, WarmStart, medial_points
 from tkamb.geometry.frames import Array, Index
 
+if TYPE_CHECKING:
+    from tkamb.contact.lattice.model import CellContact
+
 TURN_STEP = 5e-5
-"""m: step of the finite difference of femoral normals. Chosen because it is well below a cell."""
+"""m: step of the finite difference of femoral normals. It is well below a cell."""
 REGION_HOLDS_WITHIN = 0.1
 """Cells: largest distance from the last pose at which the whole solid was evaluated. Within it only
 the region is evaluated, in half the time. The residual of the whole solid is then at most 1.2 times
@@ -35,19 +36,6 @@ REGION_HOLDS_TO = 1.1
 """1: largest ratio of the contact force to that of the last evaluation of the whole solid."""
 LEVER_ARM = 0.03
 """m: distance from the femoral axis to the contact. It converts a rotation to a distance."""
-
-
-class ForceModel(Presses, Protocol):
-    """A contact model that can compute the forces alone."""
-
-    @property
-    def pressure_rule(self) -> PressureRule:
-        """See `tkamb.contact.lattice.model.CellContact`."""
-
-    def evaluate_from(
-        self, state: Any, pose: Array, start: Guess | None = None, forces_only: bool = False
-    ) -> tuple[ContactResult, WarmStart]:
-        """See `tkamb.contact.lattice.model.CellContact`."""
 
 
 class LatticeProbe(Probe):
@@ -61,7 +49,7 @@ class LatticeProbe(Probe):
     """
 
     def __init__(
-        self, model: ForceModel, state: LatticeState, start: Guess | None, accuracy: float
+        self, model: "CellContact", state: LatticeState, start: Guess | None, accuracy: float
     ) -> None:
         super().__init__(model, state, start)
         self._lattice_model, self._accuracy = model, accuracy
@@ -187,7 +175,6 @@ def force_changes(
     """Return the change (m, 3, 6) of nodal forces per small displacement of the femur.
 
     Args:
-        state: prepared contact.
         result: contact that has converged.
         displacement: displacement of all contact nodes in this contact, m, shape (c, 3).
         nodes: loaded contact nodes, shape (m,).

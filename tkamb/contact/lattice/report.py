@@ -27,20 +27,20 @@ from tkamb.contact.result import ContactResult, ContactStatus, medial_points
 from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.units import DEGREE, MILLIMETRE
 
-# Cells: distance from the peak at which the femoral normal is evaluated. Chosen because a peak at
+# Cells: distance from the peak at which the femoral normal is evaluated. A peak at
 # an edge lies one or two cells inside it.
 EDGE_DISTANCE_CELLS = 2.0
-# m: smallest distance from the peak at which the femoral normal is evaluated. Chosen because an
+# m: smallest distance from the peak at which the femoral normal is evaluated. An
 # edge of 6 mm radius then counts as an edge with fine cells too.
 LEAST_EDGE_DISTANCE = 2.0 * MILLIMETRE
-# rad: a peak is flagged if the femoral normal turns by more over that distance. Chosen because a
+# rad: a peak is flagged if the femoral normal turns by more over that distance. A
 # radius of 6 cells turns by this angle.
 SHARP_EDGE_ANGLE = 20.0 * DEGREE
-# 1: a result with a smaller principal strain is flagged. Chosen because the material law does not
+# 1: a result with a smaller principal strain is flagged. The material law does not
 # prevent strains below -1, and measured curves end before -0.4.
 STRAIN_FLAG = -0.4
-# m: a press is flagged if its travel from first touch to the first contact node is larger. Chosen
-# because the nodes of 3 mm cells miss the bottom of a ball of 15 mm radius by 0.15 mm.
+# m: a press is flagged if its travel from first touch to the first contact node is larger.
+# The nodes of 3 mm cells miss the bottom of a ball of 15 mm radius by 0.15 mm.
 MAX_UNSEEN_HEIGHT = 0.2e-3
 # 1: principal strain at which a cell has no thickness left. The result is then out of range. By
 # definition of the strain.
@@ -133,7 +133,6 @@ def unseen_flags(state: LatticeState, result: ContactResult, depth: float) -> It
     """Yield a flag if the meshes touch long before any node does.
 
     Args:
-        state: prepared contact.
         result: result of a press.
         depth: travel of the femoral component since it touched the first contact node, m.
     """
@@ -171,11 +170,9 @@ def result_of(
     """Return the result of a solution.
 
     Args:
-        state: prepared contact.
         pose: pose at approach 0 of the solution, shape (4, 4).
         load: N, or None if the pose was given.
         gaps: vertical gaps at that pose, m, shape (c,).
-        solution: solution of the lattice.
         rule: rule for the area that a nodal force acts on.
         forces_only: whether the solution is that of the region. Then nothing is flagged.
     """
@@ -219,9 +216,7 @@ def _pressures(
     """Return nodal forces (c, 3), N, pressures (c,), Pa, and the areas (c,) that they act on, m².
 
     Args:
-        state: prepared contact.
         gaps: vertical gaps of the undeformed insert at the final pose, m, shape (c,).
-        solution: solution of the lattice.
         rule: rule for the areas.
     """
     force, size = np.zeros_like(state.surface.points), np.zeros(len(gaps))
@@ -243,11 +238,9 @@ def _gaps(state: LatticeState, pose: Array, gaps: Array, force: Array, solution:
     is computed even if it is no candidate.
 
     Args:
-        state: prepared contact.
         pose: final pose, shape (4, 4).
         gaps: vertical gaps of the undeformed insert at this pose, m, shape (c,).
         force: N, shape (c, 3).
-        solution: solution of the lattice.
     """
     loaded: Mask = np.asarray(force.any(axis=1), bool)
     close = beside(state.surface.triangles, loaded) | loaded | (gaps < 0)

@@ -13,7 +13,7 @@ class LatticeSolverSettings:
     force_tolerance: float = 2e-3
     """1: largest residual force of the displaced solid, relative to the contact forces (Euclidean
     norms over the free unknowns). Smaller: more passes. Larger: fewer passes, nodal forces less
-    accurate. Chosen above the rounding residual: if `tolerance` is 1e-3 or more, the factor is
+    accurate. Above the rounding residual: if `tolerance` is 1e-3 or more, the factor is
     stored in 16-bit integers. Their rounding leaves a residual of 4e-4 (2 mm) to 1.2e-3 (1 mm) on
     the shipped knee, which passes on the region cannot remove. The work of this residual is below
     1e-5. Where it is above the tolerance (2.6e-3 at 16 kN and 1 mm), passes on the whole solid

@@ -26,7 +26,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array, Index
 
-# 1: smaller strains get the secant modulus at this strain. Chosen because stress over strain is
+# 1: smaller strains get the secant modulus at this strain. Stress over strain is
 # 0/0 at zero.
 LEAST_STRAIN = 1e-9
 
@@ -76,7 +76,7 @@ class ShearCurve:
         return np.where(equivalent < 1e-7, 0.0, slope / floored**2)
 
 
-# Number of cells whose matrices are in memory at once. Chosen because they take 9 MB.
+# Number of cells whose matrices are in memory at once. They take 9 MB.
 CELLS_AT_ONCE = 2000
 
 
@@ -149,7 +149,6 @@ class Scatter:
 
     Args:
         elements: nodes of each element (cell or spring), shape (c, p).
-        nodes: number of nodes.
     """
 
     elements: Index

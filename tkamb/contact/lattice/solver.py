@@ -67,7 +67,6 @@ class Solution:
         displacement: displacement of the candidates, m, shape (m, 3).
         field: displacement of all nodes, m, shape (n, 3); None for a linear material.
         loads: h + r, N, shape (n, 3), for a warm start; None for a linear material.
-        passes: number of passes.
         residual: residual of the whole solid.
         region: region for a warm start, or None.
         softening: s for a warm start.

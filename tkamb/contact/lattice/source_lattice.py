@@ -57,7 +57,7 @@ class ConjugateGradientSettings:
 
     tolerance: float = 0.02
     """1: largest residual relative to the right-hand side. Smaller: more iterations for each
-    tangent step. Larger: more tangent steps. Chosen because the next tangent step corrects the
+    tangent step. Larger: more tangent steps. The next tangent step corrects the
     error."""
     max_iterations: int = 60
     """Largest number of iterations for a tangent step; then the last iterate is used. Smaller: more
@@ -197,7 +197,7 @@ class LoopSettings:
     """Largest number of tangent steps at one D. Smaller: faster loops, but perhaps more of them.
     Larger: smaller residual at one D."""
     first_depth: float = 0.8
-    """1: first D, relative to the depth that the candidates cover. Chosen because the candidates
+    """1: first D, relative to the depth that the candidates cover. The candidates
     cover 1.25 times the expected approach, and 1 / 1.25 = 0.8."""
     load: float = 0.1
     """1: largest relative error of the load, relative to the solver's `force_tolerance`. Smaller:

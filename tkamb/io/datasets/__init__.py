@@ -166,7 +166,6 @@ def _get(dataset: Dataset, to: Path, fetch: Callable[[DataFile, Path], Path | No
 
     Args:
         dataset: the data set.
-        to: its folder.
         fetch: function of a file and a temporary folder, which returns the path of a copy or None.
     """
     missing = [file for file in dataset.files if not _is_there(file, to)]
@@ -188,7 +187,6 @@ def _get(dataset: Dataset, to: Path, fetch: Callable[[DataFile, Path], Path | No
 
 
 def _retrieved(address: str, file: DataFile, folder: Path) -> Path:
-    """Download a file into a folder, check its content, and return its path."""
     import pooch
     from requests.exceptions import HTTPError, RequestException
 

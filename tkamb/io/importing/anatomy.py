@@ -22,7 +22,6 @@ class Leg:
     """A leg of a model.
 
     Args:
-        model: the model.
         side: "right" or "left".
         knee: the femorotibial joint.
         flexion: name of the knee's flexion coordinate; None if the knee has no rotation coordinate.
@@ -85,7 +84,6 @@ def find_leg(model: OpenSimModel, side: str, knee: str | None = None) -> Leg:
     """Return the left or right leg of a model.
 
     Args:
-        model: the model.
         side: "right" or "left".
         knee: name of the femorotibial joint; None: the joint with "knee" or "femorotibial" in its
             name.
@@ -132,7 +130,6 @@ def find_leg(model: OpenSimModel, side: str, knee: str | None = None) -> Leg:
 def _joints(
     model: OpenSimModel, side: str, name: str | None
 ) -> tuple[Joint, Joint, Joint, tuple[str, ...], tuple[str, ...]]:
-    """Return the joints knee, hip and ankle, and the bodies of femur and tibia."""
     knee = _knee(model, side, name)
     groups = _rigid_groups(model)
     for body in (knee.inboard, knee.outboard):
@@ -160,7 +157,6 @@ def _unread_joint(model: OpenSimModel, bodies: Iterable[str] = ()) -> InputError
     """Return the error of the first joint that could not be read, or None.
 
     Args:
-        model: the model.
         bodies: the joint must concern one of these bodies; empty: any joint counts.
     """
     names = {joint.name for joint in model.joints}
@@ -172,7 +168,6 @@ def _unread_joint(model: OpenSimModel, bodies: Iterable[str] = ()) -> InputError
 
 
 def _refuse_unread(model: OpenSimModel, joints: Iterable[Joint], bodies: set[str]) -> None:
-    """Raise an InputError if a joint or constraint of the leg's bodies could not be read."""
     for joint in model.joints:
         if joint.unread and (joint in joints or {*_ends(joint)} <= bodies):
             raise _unread_joint(model, [joint.outboard]) or InputError(joint.unread)
@@ -196,7 +191,6 @@ def way_to_pelvis(leg: Leg) -> list[Joint]:
 
 
 def _check_lengths(leg: Leg) -> None:
-    """Raise an InputError if thigh or shank has no human length: the knee joint is then wrong."""
     centre = leg.knee_centre
     for name, (other, point) in {"thigh": leg.hip_centre, "shank": leg.ankle_centre}.items():
         length = float(np.linalg.norm(transform(leg.neutral[other], point) - centre))

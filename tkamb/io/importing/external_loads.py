@@ -15,7 +15,6 @@ class ExternalForce:
     """A force in a list of external loads.
 
     Args:
-        name: its name in the list.
         body: name of the body on which it acts.
         beginnings: "force", "point" or "moment" -> beginning of the names of its columns.
     """
@@ -64,7 +63,6 @@ def _columns_of(force: ExternalForce, columns: list[TableForce], path: Path) -> 
 
 
 def _external_loads(path: Path) -> tuple[Path, list[ExternalForce]]:
-    """Return the table and the forces of a list of external loads."""
     root, _ = open_document(path)
     document = Document(path, {})
     loads = root if root.tag == "ExternalLoads" else root.find("ExternalLoads")

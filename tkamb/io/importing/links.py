@@ -24,7 +24,7 @@ from tkamb.io.recordings.patient import RigidInertia, combined
 from tkamb.io.recordings.urdf_check import KNEE_JOINTS, PATELLA_JOINTS
 from tkamb.units import DEGREE
 
-# rad: largest rotation between the axes of implant and bone. Chosen because wrong mesh axes give
+# rad: largest rotation between the axes of implant and bone. Wrong mesh axes give
 # at least 90 deg and a real implantation gives a few degrees.
 MAX_IMPLANT_ROTATION = 35.0 * DEGREE
 
@@ -34,7 +34,6 @@ class MeshFrame:
     """The frame of a mesh in a body of the model.
 
     Args:
-        body: name of the body.
         pose: pose_mesh_in_body, shape (4, 4); None: at the body's origin, with anatomical axes.
         why: words for the report on how the frame was identified.
     """
@@ -55,7 +54,6 @@ def mesh_frame(leg: Leg, part: str, wished_name: str | None) -> MeshFrame:
     """Return the frame of a part's mesh: an offset frame or body of the model.
 
     Args:
-        leg: the leg.
         part: "femoral component", "insert" or "patellar button".
         wished_name: name of the offset frame or body; None: the first frame with the part in its
             name.
@@ -108,7 +106,6 @@ class Links:
     """The links of a leg. Poses are (4, 4) matrices, in m.
 
     Args:
-        leg: the leg.
         femur: pose of the femur link in the femur's body.
         tibia: pose of the tibia link in the tibia's body.
         patella: pose of the patella link in the patella's body; None without a patella.
@@ -184,7 +181,6 @@ def find_links(
     """Return the links of a leg.
 
     Args:
-        leg: the leg.
         placement: pose of the insert's mesh in the insert frame, after the mesh is turned to
             anatomical axes about its origin, shape (4, 4); None without an implant.
         axes: axes of the meshes that point anterior, superior and right.
@@ -282,7 +278,6 @@ def link_inertias(links: Links, scale: float) -> dict[str, RigidInertia]:
     The tibia link includes the foot, with the ankle at its neutral angle.
 
     Args:
-        links: the links of the leg.
         scale: factor on masses and inertias.
     """
     leg = links.leg
@@ -299,7 +294,6 @@ def link_inertias(links: Links, scale: float) -> dict[str, RigidInertia]:
 def _body_inertia(
     links: Links, body: str, base: str, link_pose: Array, scale: float
 ) -> RigidInertia:
-    """Return the inertia of a body in a link's frame. `link_pose` is given in body `base`."""
     pose = np.linalg.inv(link_pose) @ links.leg.in_body(body, base)
     inertia, turn = links.leg.model.bodies[body], pose[:3, :3]
     tensor = scale * turn @ inertia.inertia @ turn.T
@@ -310,7 +304,6 @@ def patient_urdf(links: Links, scale: float, comment: str) -> str:
     """Return the text of the URDF.
 
     Args:
-        links: the links of the leg.
         scale: factor on the model's masses.
         comment: comment at the top of the file.
     """

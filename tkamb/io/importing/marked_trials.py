@@ -19,14 +19,14 @@ from tkamb.io.recordings.tables import Table, read_table, with_unit
 from tkamb.units import DEGREE, MILLIMETRE
 
 # m: a trial is registered by default if its markers misfit the model by more (root mean square of
-# the rigid fits of shank and thigh). Chosen because markers that a standing trial has placed
+# the rigid fits of shank and thigh). Markers that a standing trial has placed
 # misfit by 2 to 5 mm, and those of a model of another session by 20 mm and more.
 MISFIT = 10.0 * MILLIMETRE
-# m: likewise for the median distance of the knee centres of shank and thigh. Chosen because frames
+# m: likewise for the median distance of the knee centres of shank and thigh. Frames
 # of a run with a larger distance are flagged.
 KNEE_DISTANCE = 20.0 * MILLIMETRE
 # m: a marker sits elsewhere in another trial if its distances to the others of its segment differ
-# by more. Chosen because skin changes them by less than 6 mm in walks and squats.
+# by more. Skin changes them by less than 6 mm in walks and squats.
 MOVED = 10.0 * MILLIMETRE
 
 
@@ -41,7 +41,6 @@ def with_registered_markers(
     Args:
         scene: content of the scene, with markers.
         request: the import.
-        links: the links of the leg.
 
     Raises:
         InputError: a trial cannot be read, or the registration fails.
@@ -78,7 +77,6 @@ def measured_markers(
     """Return segment -> measured markers (n, m, 3), m, of a recording, x forward and y up.
 
     Args:
-        path: the recording.
         request: the import, with its unit of length and marker prefix.
         segments: segments with their markers. A marker that the recording lacks is NaN.
         axes: axes of the file that point forward, up and right; None: from the markers.
@@ -136,7 +134,6 @@ def _distances(points: Array) -> Array:
 
 
 def _lines(found: Registration, model: Sequence[ModelSegment]) -> list[str]:
-    """Return the lines of the report on a registration."""
     rms = {name: found.rms(values) / MILLIMETRE for name, values in found.residuals.items()}
     apart = [distance / MILLIMETRE for distance in found.knee_distance]
     lines = [

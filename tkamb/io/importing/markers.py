@@ -43,8 +43,6 @@ def model_segments(
     """Return the segments with at least three markers: shank, thigh, and possibly foot, pelvis.
 
     Args:
-        links: the links of the leg.
-        recorded: table of markers.
         without: labels of markers to leave out.
 
     Raises:
@@ -78,8 +76,6 @@ def seen_segments(
     """Return shank, thigh, foot and pelvis with the markers that are visible in any frame.
 
     Args:
-        links: the links of the leg.
-        recorded: table of markers.
         without: labels of markers to leave out.
 
     Raises:
@@ -113,7 +109,6 @@ def placed_markers(links: Links, points: Mapping[str, Mapping[str, Array]]) -> O
     """Return the leg's model with its markers at given positions.
 
     Args:
-        links: the links of the leg.
         points: "shank", "thigh", "foot" or "pelvis" -> label -> position of the marker, m, shape
             (3,), as in `ModelSegment`. Labels match the model's markers as in `matched_labels`.
             Other segments and markers keep the model's positions.
@@ -283,7 +278,6 @@ def feet(leg: Leg, recorded: Table, other: str) -> dict[str, list[str]]:
 
     Args:
         leg: the leg of one side.
-        recorded: table of markers.
         other: the other side, "left" or "right".
     """
     labels = recorded_labels(recorded)

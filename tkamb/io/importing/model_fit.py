@@ -20,7 +20,7 @@ from tkamb.io.recordings.laboratory import laboratory_rotation
 from tkamb.io.recordings.markers import marker_trajectories, matched_labels
 from tkamb.io.recordings.tables import Table
 
-# Number of frames that are fitted in one call. It does not change the result. Chosen because the
+# Number of frames that are fitted in one call. It does not change the result. The
 # arrays then fit into the processor's cache.
 BLOCK_FRAMES = 128
 # frames: every `COARSE_STRIDE`-th frame is fitted first. Interpolation between these poses gives
@@ -29,12 +29,7 @@ COARSE_STRIDE = 8
 
 
 class ModelChain:
-    """The free coordinates of a model and some of its markers.
-
-    Args:
-        model: the model.
-        markers: names of the markers.
-    """
+    """The free coordinates of a model and some of its markers."""
 
     def __init__(self, model: OpenSimModel, markers: Sequence[str]) -> None:
         self.kinematics = Kinematics(model)
@@ -190,7 +185,6 @@ def _tree(kinematics: Kinematics, at: Sequence[int]) -> tuple[Array, Array]:
     """Return the markers and the coordinate axes that each coordinate moves.
 
     Args:
-        kinematics: kinematics of the model.
         at: index of each marker's body.
 
     Returns:
@@ -236,8 +230,6 @@ def fit_model(
     """Return a model's chain and its fit to all frames of a recording.
 
     Args:
-        model: the model.
-        recorded: table of markers.
         weights: name of a marker -> weight of its squared distance; default 1.
         laboratory_axes: axes of the file that point along the model's ground x, y and z (forward,
             up and right), like "-x,+z,+y".

@@ -75,7 +75,6 @@ def model_motion(links: Links, recorded: Table) -> ModelMotion:
     """Return the motion of knee and shank from a motion in the model's coordinates.
 
     Args:
-        links: the links of the leg.
         recorded: table of the coordinates. A column has the coordinate's name or path in the model.
 
     Raises:

@@ -36,8 +36,8 @@ from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import Case, load_case
 from tkamb.units import DEGREE, MILLIMETRE
 
-# A model is of one leg if thigh, shank and foot have more than this share of its mass. Chosen
-# because one leg has less than a fifth of a whole body's mass.
+# A model is of one leg if thigh, shank and foot have more than this share of its mass.
+# One leg has less than a fifth of a whole body's mass.
 ONE_LEG_SHARE = 0.6
 # Share of the body's mass in one leg, from thigh 0.100, shank 0.0465 and foot 0.0145 (Winter,
 # Biomechanics, 2009).
@@ -45,8 +45,8 @@ LEG_MASS_SHARE = 0.161
 # The report of an import gives reasons for at most this number of unreadable parts. Chosen to keep
 # the report short.
 MAX_REASONS = 3
-# The model is not scaled if its mass differs from the subject's by less than this share. Chosen
-# because such a difference may come from clothes and rounding.
+# The model is not scaled if its mass differs from the subject's by less than this share.
+# Such a difference may come from clothes and rounding.
 SAME_MASS_SHARE = 0.01
 
 
@@ -61,7 +61,6 @@ class ImportedPatient:
 
     Args:
         urdf: text of patient.urdf.
-        scene: content of the scene file.
         motion: text of motion.csv; None: the scene reads the recorded motion.
         report: lines on the files read and the assumptions made.
         ground: text of ground_reaction.csv; None: the scene reads the recorded forces, if any.
@@ -173,7 +172,6 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
 
 
 def _trial(request: ImportRequest, leg: Leg, links: Links, insert: Surface | None) -> Trial:
-    """Return the trial from recorded poses, markers or the model's coordinates."""
     recorded = with_unit(read_table(request.recording), request.units.length)
     if request.prefix is not None:
         recorded = with_prefix(recorded, request.prefix)
@@ -204,8 +202,6 @@ def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[st
 
     Args:
         patient: the result of the import.
-        folder: the scene's folder.
-        name: the scene's file name.
 
     Raises:
         InputError: the folder cannot be written, a file of the same name has another content, or
@@ -381,7 +377,6 @@ def _leg_scale(request: ImportRequest, leg_mass: float) -> tuple[float, str]:
 
 
 def _model_lines(model: OpenSimModel) -> list[str]:
-    """Return notes on reading the model, and lines on unreadable parts that are not needed."""
     lines = [f"model: {notice}" for notice in model.notices]
     unread = [f"{element.kind} '{element.name}'" for element in model.unread]
     if unread:

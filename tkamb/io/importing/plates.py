@@ -164,25 +164,25 @@ def _kind_of_words(stem: str) -> str | None:
     return None
 
 
-# N: a plate is loaded above this vertical force. Chosen because the noise of a plate is a few
+# N: a plate is loaded above this vertical force. The noise of a plate is a few
 # newtons.
 MIN_FORCE = 40.0
-# s: a shorter load is not a step. Chosen because shorter loads are knocks on the plate.
+# s: a shorter load is not a step. Shorter loads are knocks on the plate.
 MIN_DURATION = 0.1
 # m: largest horizontal distance from the centre of pressure to the mean position of the foot's
-# markers. Chosen because a foot is about this long.
+# markers. A foot is about this long.
 MAX_FOOT_DISTANCE = 0.25
-# m: a foot stands on a step if its markers are higher above the plate than this. Chosen because
-# the lowest stair of the data sets is 0.17 m high.
+# m: a foot stands on a step if its markers are higher above the plate than this.
+# The lowest stair of the data sets is 0.17 m high.
 MIN_STEP_HEIGHT = 0.15
-# m: mean height of a foot's markers above the surface under the foot. Chosen because it is a usual
+# m: mean height of a foot's markers above the surface under the foot. It is a usual
 # value on level ground.
 MARKER_HEIGHT = 0.055
-# m: two surfaces with a smaller difference in height are one step. Chosen because the steps of
+# m: two surfaces with a smaller difference in height are one step. The steps of
 # stairs differ by more.
 SAME_HEIGHT = 0.05
-# m/s: a foot off the plates that is slower than this may stand on an unmeasured surface. Chosen
-# because a swinging foot is faster.
+# m/s: a foot off the plates that is slower than this may stand on an unmeasured surface.
+# A swinging foot is faster.
 MAX_STANDING_SPEED = 0.15
 
 
@@ -192,7 +192,6 @@ class RecordedForce:
 
     Args:
         key: number of the plate, or name of the table's force.
-        title: name in messages.
         time: times, s, shape (k,).
         wrench: force (N) and moment (N·m) about the laboratory's origin, shape (k, 6).
         level: height of the plate's surface, m.
@@ -240,7 +239,6 @@ class Load:
 
     Args:
         plate: number of the plate, or name of the table's force.
-        title: name in messages.
         side: "left" or "right" foot; "": no foot's markers are near.
         start: time of the load's first sample, s.
         end: time of the load's last sample, s.
@@ -264,7 +262,6 @@ class Feet:
     """Positions of the feet.
 
     Args:
-        path: the recording, for messages.
         time: times, s, shape (n,).
         middles: side -> mean position of the foot's markers in the laboratory, m, shape (n, 3);
             NaN where no marker is visible.
@@ -279,7 +276,6 @@ def marked_feet(recorded: Table, axes: str, labels: dict[str, list[str]]) -> Fee
     """Return the positions of the feet in a recording of markers.
 
     Args:
-        recorded: table of markers.
         axes: axes of the file that point forward, up and right, like "-x,+z,+y".
         labels: side -> labels of the foot's markers.
     """
@@ -347,9 +343,7 @@ def own_plates(
     """Return the plates on which only this foot stood.
 
     Args:
-        loads: all loads of the recording.
         side: "left" or "right".
-        path: the recording, for messages.
         hint: advice in messages.
 
     Raises:

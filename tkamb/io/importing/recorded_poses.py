@@ -30,7 +30,6 @@ class ShankMarkers:
     """Markers that give the pose of the tibia link in the laboratory.
 
     Args:
-        path: the recording.
         axes: axes of the file that point forward, up and right.
         points: label of a marker -> its position in the tibia link, m, shape (3,).
         centres: name of a joint centre that is used as a further marker -> lines of the scene's
@@ -68,7 +67,6 @@ def shank_markers(
     the recorded poses.
 
     Args:
-        links: the links of the leg.
         segments: name of a segment -> its visible markers.
         femur: poses of the femur's body in the tibia link, m, shape (n, 4, 4).
         recording: the file of the markers.
@@ -148,7 +146,6 @@ class PoseRecording:
     """A table of poses of the femoral mesh in the insert mesh's axes, and its reading options.
 
     Args:
-        file: the table.
         columns: names of the columns with the `ROLES`: three angles in the order of `sequence`,
             then x, y, z.
         sequence: axes of the rotations, as in scipy: "XYZ" is Rx Ry Rz.
@@ -195,7 +192,6 @@ class RecordedPoses:
         time: times in the recording of markers, s, shape (n,).
         femur: poses of the femur's body in the tibia link, m, shape (n, 4, 4).
         in_stance: mask of the poses with a loaded foot, shape (n,).
-        remarks: lines for the report.
     """
 
     given: PoseRecording
@@ -234,7 +230,6 @@ def read_poses(
 
     Args:
         recording: the table of poses.
-        links: the links of the leg.
         insert: mesh of the insert about its own origin, in anatomical axes.
         axes: axes of the meshes that point anterior, superior and right.
         cutoff_Hz: cut-off frequency of the scene's low-pass filter, Hz.

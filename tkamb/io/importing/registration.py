@@ -48,7 +48,7 @@ class RegistrationSettings:
     """m: scale τ of a marker's distance from the model's position in each direction. Not studied:
     hands place markers to about this accuracy."""
     marker_freedom: float = 4.0
-    """Degrees of freedom of Student's t of that distance. Chosen because single markers lie much
+    """Degrees of freedom of Student's t of that distance. Single markers lie much
     farther away: of subject DM one by 80 mm."""
     joint: float = 5.0 * MILLIMETRE
     """m: deviation τ of hip and ankle centre in thigh and shank. An assumption: bone lengths from
@@ -73,7 +73,7 @@ class RegistrationSettings:
     a segment together. Shank and thigh as in `SKIN_MARKER_ERROR`; foot and pelvis are
     assumptions."""
     noise_rounds: int = 6
-    """Number of estimates of σ. Chosen because the fourth changes it by less than 2 %."""
+    """Number of estimates of σ. The fourth changes it by less than 2 %."""
     tolerance: float = 1e-6
     """m and rad: the search ends after a smaller step. Far below the noise of markers."""
     max_iterations: int = 60
@@ -106,8 +106,6 @@ class Registration:
         knee_centre: deviation of the knee's centre, as the shank's markers place it, in the axes
             of the shank, m, (3,).
         frontal_alignment: deviation of the shank's angle in the frontal plane, rad.
-        frames: number of frames.
-        trials: names of the trials.
     """
 
     segments: tuple[ModelSegment, ...]
@@ -202,7 +200,6 @@ def misfit(
     """Return how far the markers of a trial misfit the model.
 
     Args:
-        links: links of the leg.
         segments: segments with the model's markers.
         measured: segment -> measured markers (n, m, 3), m.
 

@@ -37,9 +37,7 @@ class ImportRequest:
         scale_mass: whether the model's masses are scaled to the subject's mass.
         method: method of fitting the markers, "segments" or "chain".
         cutoff_Hz: cut-off frequency of the low-pass filter of markers and plates.
-        contact: name of the scene's contact model.
         activity: activity whose published peaks the report shows; None: no peaks.
-        notes: the user's notes for the report.
         prefix: prefix of the markers to use, if a label occurs with several prefixes.
         muscles: whether all muscles of the model share the load; otherwise only the quadriceps.
         cycle: times of 0 and 100 % of the gait cycle, s; "plates": two foot strikes on the plates.

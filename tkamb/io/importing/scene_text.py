@@ -46,7 +46,6 @@ class GroundFile:
     """Source of the ground reaction: plates of a C3D file, or columns of a table.
 
     Args:
-        path: the file.
         axes: axes of the file that point forward, up and right.
         plates: numbers of the plates under the foot.
         columns: (role, name) of each column of a table.
@@ -71,7 +70,6 @@ class MarkerFile:
     """A recording of markers, and the options with which the scene reads it.
 
     Args:
-        path: the file.
         axes: axes of the file that point forward, up and right.
         segments: segments with their markers.
         method: fit of the markers, "segments" or "chain".
@@ -106,16 +104,13 @@ class SceneText:
         mass_kg: mass of the subject.
         urdf: name of the URDF file, in the same folder.
         cutoff_Hz: cut-off frequency for markers and plates.
-        links: the links of the leg.
         markers: recording of markers for knee and shank, or None.
         poses: recorded poses of the femoral component, or None.
         shank: markers that give the shank's pose, or None; needed with `poses`.
         ground: the ground reaction, or None.
         meshes: meshes of the implant, or None.
         tissue: muscles and ligaments.
-        contact: name of the contact model.
         activity: activity whose published peaks the report shows; None: no peaks.
-        notes: notes for the report.
         model: the .osim file, if all its muscles act; None: only the quadriceps acts.
         coordinates: file of the model's coordinates; None: they are fitted to the markers.
         cycle: times of 0 and 100 % of the gait cycle, s; "plates": from foot strikes on the

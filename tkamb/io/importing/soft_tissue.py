@@ -57,7 +57,6 @@ def soft_tissue(links: Links, straight_ligaments: bool = False) -> SoftTissue:
     """Return the muscles and ligaments of a leg that the scene can describe.
 
     Args:
-        links: links of the leg.
         straight_ligaments: whether the surfaces that ligaments wrap are left out.
     """
     text: list[str] = []

@@ -92,7 +92,6 @@ def calibrated_markers(
     Args:
         table: markers and joints of the scene. Markers that the trial lacks are ignored.
         recorded: table of the standing trial.
-        side: side of the leg.
         pose_insert_in_tibia: pose of the insert frame in the tibia link, shape (4, 4), mirrored
             for a left leg.
 
@@ -123,7 +122,7 @@ def calibrated_markers(
     return result
 
 
-# Number of frames per period of the cut-off frequency. Chosen because a motion that is low-pass-
+# Number of frames per period of the cut-off frequency. A motion that is low-pass-
 # filtered at this frequency changes little between two such frames.
 FRAMES_PER_PERIOD = 5.0
 
@@ -134,7 +133,6 @@ class Trial:
 
     Args:
         ground: the ground reaction; None: none is modelled.
-        remarks: lines for the report.
         markers: recording of markers; None: the motion is not from markers.
         motion: motion from the model's coordinates; None: the motion is not from coordinates.
         poses: recorded poses of the knee; None: the motion is not from poses.

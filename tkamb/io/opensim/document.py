@@ -36,7 +36,6 @@ class Document:
     """An OpenSim document, with the default values of its classes.
 
     Args:
-        path: the file.
         defaults: name of a class -> element with the default values of the class.
         partial: whether an element that cannot be read is added to `unread`; otherwise it is an
             error.
@@ -254,7 +253,6 @@ def open_document(path: Path) -> tuple[Element, list[str]]:
 
 
 def _read(path: Path, notices: list[str]) -> Element:
-    """Return the root element of one file. If it is not strict XML, it is repaired first."""
 
     content = read_bytes(path, what=WHAT)
     try:

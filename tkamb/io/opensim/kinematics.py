@@ -65,11 +65,7 @@ def velocities(twists: Array, positions: Array) -> Array:
 
 
 class Kinematics:
-    """The kinematic chain of an OpenSim model, prepared for many evaluations.
-
-    Args:
-        model: the model.
-    """
+    """The kinematic chain of an OpenSim model, prepared for many evaluations."""
 
     def __init__(self, model: OpenSimModel) -> None:
         self.model = model

@@ -58,7 +58,6 @@ class PathWrap:
     """The use of a wrap object by one path.
 
     Args:
-        wrap_object: name of the wrap object.
         first: index of the first path point of the part that may wrap.
         last: index of the last path point of this part.
         method: OpenSim's method for an ellipsoid: "hybrid", "midpoint" or "axial".
@@ -88,7 +87,6 @@ class OpenSimMuscle:
         path: path of the muscle.
         max_isometric_force_N: maximum isometric force.
         optimal_fibre_length_m: fibre length at the maximum isometric force.
-        tendon_slack_length_m: tendon slack length.
         pennation_rad: pennation angle at the optimal fibre length.
         max_contraction_velocity: maximum contraction velocity, optimal fibre lengths per second.
         enabled: whether the muscle is switched on in the file.
@@ -147,7 +145,6 @@ class Body:
 
     Args:
         name: the body's name.
-        mass_kg: mass.
         centre: centre of mass in the body's frame, m, shape (3,).
         inertia: inertia tensor about the centre of mass, kg·m², shape (3, 3).
     """
@@ -164,7 +161,6 @@ class Coordinate:
 
     Args:
         name: the coordinate's name.
-        joint: name of its joint.
         rotational: whether the coordinate is an angle. Files "in degrees" state it in degrees.
         default: default value.
         range: smallest and largest value.
@@ -297,7 +293,6 @@ class OpenSimModel:
     """An OpenSim model.
 
     Args:
-        name: the model's name.
         gravity: acceleration of gravity in ground, m/s², shape (3,). It is along -y: the file's
             ground is turned upright when the file is read.
         bodies: name -> body, without ground.

@@ -38,7 +38,6 @@ def inverse_dynamics(
     Constraints and couplers are ignored: every coordinate counts as independent.
 
     Args:
-        kinematics: the chain of the model.
         q: coordinates, rad and m, shape (f, n).
         rates: first time derivatives of the coordinates, shape (f, n).
         accelerations: second time derivatives of the coordinates, shape (f, n).
@@ -65,7 +64,6 @@ def required_wrenches(
     the joint exert on them.
 
     Args:
-        kinematics: the chain of the model.
         motion: poses and twists at q.
         q: coordinates, rad and m, shape (f, n).
         rates: first time derivatives of the coordinates, shape (f, n).
@@ -123,10 +121,10 @@ def _cross(twist: Array, axis: Array) -> Array:
     return np.hstack([np.cross(omega, axis[:, :3]), linear])
 
 
-# rad: a larger joint angle cannot be in radians. Chosen because no joint exceeds a whole turn,
+# rad: a larger joint angle cannot be in radians. No joint exceeds a whole turn,
 # 6.28, while angles in degrees are larger in most movements.
 MAX_RADIANS = 6.5
-# deg: a joint that rotates by less in a whole recording is considered fixed. Chosen because the
+# deg: a joint that rotates by less in a whole recording is considered fixed. The
 # noise of a recording is about as large.
 MIN_ROTATION_DEG = 0.2
 
@@ -152,7 +150,6 @@ def read_coordinates(kinematics: Kinematics, recorded: Table) -> tuple[Array, tu
     """Return recorded coordinates, and the names of coordinates that the table lacks.
 
     Args:
-        kinematics: the chain of the model.
         recorded: table (`.mot`, `.sto`) of the coordinates. A column has the coordinate's name or
             path in the model.
 
@@ -221,8 +218,6 @@ def angle_lines(kinematics: Kinematics, recorded: Table, q: Array) -> tuple[str,
     """Return a remark if the angles are too small for their stated unit.
 
     Args:
-        kinematics: the chain of the model.
-        recorded: the table.
         q: coordinates from the table, rad and m, shape (f, n).
     """
     coordinates = kinematics.model.coordinates
@@ -251,12 +246,10 @@ def coordinate_motion(
     c'' = f' q'' + f'' q'².
 
     Args:
-        kinematics: the chain of the model.
         time: times of the samples, s, shape (m,).
         q: coordinates, rad and m, shape (m, n). Values of dependent coordinates are ignored.
         cutoff_Hz: cut-off frequency, Hz, as in `differentiate_coordinates`.
         at: times of the result, s, shape (f,); None: `time`.
-        name: name of the data in messages.
     """
     values, rates, second = differentiate_coordinates(time, q, cutoff_Hz, at, name=name)
     for coupler in kinematics.model.couplers:

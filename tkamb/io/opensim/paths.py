@@ -33,7 +33,7 @@ from tkamb.knee.taut_strings import strings_over
 
 # rad or m: margin of the range of a conditional path point, as in OpenSim.
 CONDITION_TOLERANCE = 1e-5
-# Number of frames that are evaluated in one call. It does not change the result. Chosen because it
+# Number of frames that are evaluated in one call. It does not change the result. It
 # limits the arrays to some tens of megabytes.
 BLOCK_FRAMES = 256
 
@@ -73,7 +73,6 @@ class LineSet:
     """Muscles and ligaments of an OpenSim model, prepared for many poses.
 
     Args:
-        kinematics: the chain of the model.
         names: names of muscles and ligaments; None: all muscles.
 
     Raises:

@@ -52,8 +52,8 @@ GRAVITY_SHARE = 0.01
 # rad: largest angle between gravity and an axis of ground that counts as rounding. It turns 0.01 %
 # of the weight aside.
 ALIGNED = 1e-4
-# m: largest distance between joints on one body, in a file without a unit of length. Chosen
-# because no segment of a person is as long.
+# m: largest distance between joints on one body, in a file without a unit of length.
+# No segment of a person is as long.
 LONGEST = 3.0
 
 
@@ -61,7 +61,6 @@ def read_osim(path: str | Path, partial: bool = False) -> OpenSimModel:
     """Return the model in an .osim file.
 
     Args:
-        path: the file.
         partial: whether joints, constraints, forces, wrap objects and markers that cannot be read
             are listed in `unread`; otherwise they are errors. A joint is welded if only its motion
             cannot be read.

@@ -46,7 +46,6 @@ class Frames:
     stored by owner and name.
 
     Args:
-        document: the document, for messages.
         bodies: names of the bodies, including ground.
         offsets: (owner, frame) -> the frame's parent, and the frame's pose (4, 4) in the parent.
         unread: name of a frame -> reason for which it could not be read.

@@ -41,7 +41,6 @@ class Recording:
     """One trial, in the axes of the file.
 
     Args:
-        path: the file.
         rate_Hz: frames per second of the markers.
         first_frame: number of the first frame, counted from zero.
         labels: (m) names of the markers as in the file; `marker 7` for a marker without one.
@@ -150,7 +149,6 @@ def read_c3d(path: str | Path, units: GivenUnits | None = None) -> Recording:
     """Read a C3D file.
 
     Args:
-        path: the file.
         units: the user's units; None: those of the file.
 
     Raises:
@@ -187,7 +185,6 @@ class _Reader:
         return self.file.parameters
 
     def recording(self) -> Recording:
-        """Return the recording."""
         rate = self._rate()
         labels, equal = self._labels()
         scale = self._metres_per_unit()
@@ -229,7 +226,6 @@ class _Reader:
         raise InputError(f"markers have a rate of {rates[0] or 0:g} Hz", self.path, EXPORT)
 
     def _labels(self) -> tuple[tuple[str, ...], list[str]]:
-        """Return a label per marker, and the labels that several markers share."""
         count = self.file.points.shape[1]
         stated = self._parameters.texts("POINT:LABELS")[:count]
         stated += [""] * (count - len(stated))
@@ -288,7 +284,6 @@ class _Reader:
     def _plates(
         self, names: list[str], signals: Array, units: list[str], scale: float | None
     ) -> tuple[ForcePlate, ...]:
-        """Return the readable plates. `faults` gets the error of each unreadable plate."""
         try:
             used = self._parameters.integers("FORCE_PLATFORM:USED")
         except InputError as error:
@@ -325,7 +320,6 @@ class _Reader:
     def _record(
         self, number: int, names: list[str], signals: Array, units: list[str], scale: float | None
     ) -> PlateRecord:
-        """Return the file's description of a plate."""
         where, k = f"{self.path}: force plate {number}", number - 1
         if "channels" in self.faults:
             raise self.faults["channels"]

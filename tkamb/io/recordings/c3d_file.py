@@ -43,7 +43,6 @@ class Header:
     """The header, in the first block.
 
     Args:
-        markers: number of markers.
         analog: analog values per frame, of all channels.
         samples: analog samples of a channel per frame.
         first: number of the first frame, from 1.
@@ -73,7 +72,6 @@ class Parameters:
     """Groups of named values.
 
     Args:
-        path: the file, for messages.
         values: "GROUP:NAME" -> array of numbers (the first index runs fastest in the file), or
             list of texts.
         damaged: names of the parameters whose record cannot be read.
@@ -135,7 +133,6 @@ class C3dFile:
     """The content of a file.
 
     Args:
-        header: the header of the file.
         parameters: the parameters of all groups.
         first_frame: number of the first frame, counted from zero.
         points: (n, m, 3) in the file's length unit, gaps NaN.
@@ -177,7 +174,6 @@ def parse_c3d(content: bytes, path: Path) -> C3dFile:
 
 
 def _header(content: bytes, machine: int) -> Header:
-    """Return the header; its numbers are checked later."""
     words = np.frombuffer(content, ">u2" if machine == _MIPS else "<u2", 10)
     scale = _floats(content[12:16], machine)[0]
     rate = _floats(content[20:24], machine)[0]
@@ -406,7 +402,6 @@ class _Data:
         )
 
     def _empty(self) -> InputError:
-        """Return the error for a file without markers and analog channels."""
         rotations = self.parameters.texts("ROTATION:LABELS")
         if not rotations and not self.parameters.integers("ROTATION:USED"):
             return InputError("holds neither markers nor analog channels", self.path, EXPORT)
@@ -451,7 +446,6 @@ class _Data:
         return 0 <= spare < BLOCK
 
     def _first(self) -> int:
-        """Return the number of the first frame, from zero."""
         trial = self.parameters.integers("TRIAL:ACTUAL_START_FIELD")
         first = self.header.first
         if len(trial) == 2:

@@ -40,12 +40,12 @@ if TYPE_CHECKING:
 Cutoff = float | Literal["none"]
 
 
-# Degree of the splines. Chosen because accelerations are then cubic and continuous.
+# Degree of the splines. Accelerations are then cubic and continuous.
 DEGREE = 5
-# Largest number of knots per period of the cut-off frequency. Chosen because the splines then
+# Largest number of knots per period of the cut-off frequency. The splines then
 # follow all frequencies that the filter passes.
 KNOTS_PER_PERIOD = 16
-# Shortest motion, in periods of the cut-off frequency. Chosen because in a shorter motion all
+# Shortest motion, in periods of the cut-off frequency. In a shorter motion all
 # samples are near an end.
 MIN_PERIODS = 1.0
 
@@ -66,7 +66,6 @@ def differentiate_coordinates(
         cutoff_Hz: frequency at which the amplitude is halved, or "none".
         at: (f,) s, times of the result, within `time`; default: `time`.
         periodic: whether the samples are one closed cycle, from time[0] to time[-1].
-        name: name of the data, for messages.
 
     Returns:
         Value, first and second derivative, each (f, k) or (f,).
@@ -106,7 +105,6 @@ def differentiate_poses(
         poses: (n, 4, 4) pose_body_in_world, m.
         cutoff_Hz: frequency at which the amplitude is halved, or "none".
         at: (f,) s, times of the result, within `time`; default: `time`.
-        name: name of the data, for messages.
 
     Returns:
         Poses (f, 4, 4), spatial velocity (f, 6) and spatial acceleration (f, 6). Both are linear,

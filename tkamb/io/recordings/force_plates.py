@@ -43,13 +43,13 @@ _log = logging.getLogger("tkamb")
 
 
 # N: largest standard deviation of the vertical force of an unloaded plate, over the frames of
-# ZERO. Chosen because a foot strike or toe-off gives more.
+# ZERO. A foot strike or toe-off gives more.
 STEADY_N = 10.0
 # N: largest mean vertical force, over the frames of ZERO, that counts as drift of the amplifier.
-# Chosen because a foot exerts more.
+# A foot exerts more.
 BASELINE_N = 20.0
 # 1: as `BASELINE_N`, but a share of the largest change of the vertical force; the larger limit
-# holds. Chosen because a standing person exerts more.
+# holds. A standing person exerts more.
 BASELINE_SHARE = 0.2
 
 
@@ -97,7 +97,6 @@ class ForcePlate:
 
     Args:
         number: number in the file, from 1.
-        channels: names of its channels.
         corners: (4, 3) m, corners of the surface.
         force: (k, 3) N, on the foot; NaN where the file has no value.
         moment: (k, 3) N·m, on the foot, about the centre of the surface.
@@ -310,7 +309,6 @@ def _wrench(kind: int, s: Array, origin: Array) -> tuple[Array, Array]:
 
 
 def _axes(corners: Array, where: str) -> Array:
-    """Return the plate's axes (3, 3) as columns."""
     x, y = corners[0] - corners[1], corners[0] - corners[3]
     z = np.cross(x, y)
     if not np.isfinite(corners).all() or not np.linalg.norm(z) >= 1e-4:
@@ -371,23 +369,23 @@ def _no_unit(record: PlateRecord, unit: str, key: str, example: str) -> InputErr
     )
 
 
-# N: smallest load, above the unloaded level. Chosen because 20 N is usual for ground reactions.
+# N: smallest load, above the unloaded level. 20 N is usual for ground reactions.
 LOAD_N = 20.0
-# s: time before and after a load in which the wrench is used. Chosen because a foot strikes or
+# s: time before and after a load in which the wrench is used. A foot strikes or
 # leaves within 0.02 s.
 MARGIN_S = 0.05
 # 1: this share of the samples, those with the smallest forces, is taken as unloaded. Their median
-# is the unloaded level. Chosen because a plate is usually unloaded for longer.
+# is the unloaded level. A plate is usually unloaded for longer.
 QUIET_SHARE = 0.1
-# N: largest range of these samples. A larger range gives no unloaded level. Chosen because the
+# N: largest range of these samples. A larger range gives no unloaded level. The
 # force of a foot varies more.
 QUIET_SPREAD_N = 2.0
-# N: largest unloaded level that counts as drift. Chosen because a foot exerts more.
+# N: largest unloaded level that counts as drift. A foot exerts more.
 MOST_DRIFT_N = 60.0
-# N: a larger unloaded level gets a note. Chosen because the median of noise is zero, and 2 N
+# N: a larger unloaded level gets a note. The median of noise is zero, and 2 N
 # change the force of the knee by less than 0.5 % of a body weight.
 DRIFT_N = 2.0
-# s: shortest unloaded time from which drift is computed. Chosen because a foot in swing leaves the
+# s: shortest unloaded time from which drift is computed. A foot in swing leaves the
 # plate for longer.
 UNLOADED_S = 0.1
 

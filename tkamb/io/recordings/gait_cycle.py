@@ -16,7 +16,7 @@ from tkamb.geometry.frames import Array, Mask
 # N: smallest vertical force of a foot on the ground; Zeni et al., Gait & Posture 27:710 (2008). It
 # is above a plate's noise, and reached within some milliseconds of the strike.
 CONTACT_FORCE_N = 20.0
-# s: shortest stance or swing; a shorter one is noise. Chosen because stance and swing of walking
+# s: shortest stance or swing; a shorter one is noise. Stance and swing of walking
 # last 0.6 and 0.4 s.
 SHORTEST_PHASE_S = 0.1
 
@@ -145,7 +145,6 @@ class Cycle:
             knee: (n, 6) knee coordinates at `percent`.
             interval: start and end of the cycle, s.
             offset_percent: per cent of the cycle at the interval's start.
-            path: the file, for messages.
 
         Raises:
             InputError: `percent` is outside 0 to 100 or spans less than 2, the interval does not

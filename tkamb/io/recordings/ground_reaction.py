@@ -35,14 +35,14 @@ DIRECTIONS = ("forward", "upward", "rightward")
 
 
 # m: largest change of height of the centre of pressure on a level plate, and largest height
-# between plates. Chosen because rounding is smaller.
+# between plates. Rounding is smaller.
 LEVEL_TOLERANCE = 0.01
-# s: time before and after the frames in which samples are searched for odd values. Chosen because
-# the filter's response is several times shorter.
+# s: time before and after the frames in which samples are searched for odd values.
+# The filter's response is several times shorter.
 WINDOW = 0.5
 # N·m: a larger horizontal moment is about a point other than the centre of pressure.
 MOMENT_TOLERANCE = 1e-6
-# m: largest horizontal distance of the centre of pressure from the ankle. Chosen because it is
+# m: largest horizontal distance of the centre of pressure from the ankle. It is
 # more than the length of a foot; a farther point is under another foot.
 MAX_ANKLE_DISTANCE = 0.5
 
@@ -248,7 +248,6 @@ def _complete_part(
 
 
 def _read_table(source: GroundReactionTable) -> RecordedReaction:
-    """Return the ground reaction of a table. The height of the points is zero without a column."""
     if source.surface_mm:
         raise InputError(
             "is for plates of a .c3d; a table states its points itself",
@@ -423,7 +422,6 @@ def summed_reaction(
         wrenches: each (k, 6), force and moment about the laboratory's origin.
         level: m, height of the point.
         unloaded: N, vertical force below which the point is interpolated in time.
-        path: the file, for messages.
     """
     wrench = np.sum(wrenches, axis=0)
     force, about_origin = wrench[:, :3], wrench[:, 3:]

@@ -23,11 +23,11 @@ from scipy.spatial.transform import Rotation
 
 from tkamb.geometry.frames import Array, knee_pose, pose, transform
 
-# m and rad: a frame has converged when its step is smaller. Chosen because it is far below the
+# m and rad: a frame has converged when its step is smaller. It is far below the
 # noise of markers.
 STEP_TOLERANCE = 1e-6
 # m and rad: after a smaller step, the next step includes the curvature of the residuals (Newton);
-# otherwise it does not (Gauss-Newton). Chosen because Newton's method converges near the solution
+# otherwise it does not (Gauss-Newton). Newton's method converges near the solution
 # only.
 NEWTON_BELOW = 0.1
 # Largest number of iterations of a frame. Not studied.
@@ -117,7 +117,6 @@ def fit_chain(
     """Return the weighted least-squares fit of a chain, all frames at once.
 
     Args:
-        chain: the chain.
         measured: (f, m, 3) m, gaps NaN.
         weights: (m,) weights of the squared distances.
         start: initial guess.

@@ -16,7 +16,6 @@ def laboratory_rotation(axes: str, path: Path) -> Array:
 
     Args:
         axes: the file's axes that point forward, up and right, like "-x,+y,-z".
-        path: the file, for the message.
 
     Raises:
         InputError: the axes are left-handed.

@@ -45,7 +45,7 @@ KNEE_SEGMENTS = ("shank", "thigh")
 
 
 # m: largest distance between two positions of one joint, each by the markers of one segment.
-# Chosen because skin at the hip moves by a third of this, and the other foot is farther away.
+# Skin at the hip moves by a third of this, and the other foot is farther away.
 MAX_JOINT_GAP = 0.1
 
 
@@ -64,7 +64,6 @@ class MarkerKinematics:
         centre_distance: (n,) m, distance between the knee centres by the separate fits of shank
             and thigh.
         missing: (n,) number of missing markers of shank and thigh.
-        remarks: notices on the file.
     """
 
     time: Array

@@ -14,7 +14,7 @@ from tkamb.io.recordings.recording_tables import TibiaTable
 from tkamb.io.recordings.tables import Table
 from tkamb.units import MILLIMETRE
 
-# m: largest median residual. Chosen because soft tissue causes less; a larger residual is due to a
+# m: largest median residual. Soft tissue causes less; a larger residual is due to a
 # wrong marker or unit.
 MAX_MEDIAN_RESIDUAL = 0.05
 
@@ -206,7 +206,6 @@ def complete_run(
         time: (n,) s.
         start: start of the interval, s.
         end: end of the interval, s.
-        table: the recording, for the message.
 
     Raises:
         InputError: the recording does not cover the interval, or a marker is missing in it.

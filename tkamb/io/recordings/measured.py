@@ -29,7 +29,7 @@ FORCE = {"N": 1.0, "kN": 1e3, "lbf": 4.4482216152605}
 """Newtons per unit of force; lbf: 0.45359237 kg x 9.80665 m/s²."""
 
 
-# 1: widest gap to interpolate, in median time steps. Chosen because one sample may be lost.
+# 1: widest gap to interpolate, in median time steps. One sample may be lost.
 MAX_GAP = 2.5
 
 
@@ -38,10 +38,8 @@ class MeasuredForce:
     """Measured axial forces on the insert; compression is positive.
 
     Args:
-        path: the file.
         time: (n,) s, on the clock of the motion.
         force: "total", "medial" or "lateral", if known -> (n,) N, gaps NaN.
-        remarks: notices on the file.
     """
 
     path: Path
@@ -105,13 +103,13 @@ def _with_third(force: dict[str, Array]) -> dict[str, Array]:
     return force
 
 
-# Order of each Butterworth filter in one direction. Chosen because forwards and backwards together
+# Order of each Butterworth filter in one direction. Forwards and backwards together
 # give the usual fourth order.
 FILTER_ORDER = 2
-# 1: smallest peak of an envelope, as a share of the signal's largest value. Chosen because a
+# 1: smallest peak of an envelope, as a share of the signal's largest value. A
 # smaller peak is round-off.
 FLAT_SHARE = 1e-9
-# 1: largest deviation of a time step from the median step, as a share of it. Chosen because the
+# 1: largest deviation of a time step from the median step, as a share of it. The
 # jitter of a clock is smaller.
 STEP_TOLERANCE = 0.01
 
@@ -121,12 +119,10 @@ class Envelopes:
     """Normalised envelopes of EMG, at times on the motion's clock.
 
     Args:
-        path: the file.
         time: (n,) s.
         values: channel -> (n,), 1 at the normalising value.
         channel_of: muscle -> channel.
         normalised_by: channel -> the normalising value, in the file's unit.
-        remarks: notices on the file.
     """
 
     path: Path

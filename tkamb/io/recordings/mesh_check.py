@@ -21,13 +21,13 @@ from tkamb.io.recordings.meshes import (
 )
 from tkamb.units import LENGTH
 
-# m: assumed length of a mesh whose unit cannot be guessed. Chosen because a knee component has
+# m: assumed length of a mesh whose unit cannot be guessed. A knee component has
 # this length.
 TYPICAL_SIZE = 0.08
-# 1: smallest area of a flat side in the report, as a share of the mesh's area. Chosen because the
+# 1: smallest area of a flat side in the report, as a share of the mesh's area. The
 # bottom of an insert is larger.
 MIN_SIZE_SHARE = 0.12
-# Largest number of bodies in the report. Chosen because a report should be short.
+# Largest number of bodies in the report. A report should be short.
 MAX_LISTED = 10
 
 
@@ -71,8 +71,6 @@ class MeshHealth:
     """Content of a mesh file. Lengths are in the file's units.
 
     Args:
-        file: path of the file.
-        triangles: number of triangles in the file.
         vertices: number of vertices after equal corners are merged.
         extents: lengths along the mesh's x, y and z.
         components: number of connected parts.
@@ -243,7 +241,6 @@ def mended_mesh(path: str | Path) -> tuple[Repair, float]:
 
 
 def _measure(vertices: Array, faces: Indices) -> tuple[Array, list[str], float]:
-    """Return the extents (3,), the units of plausible size, and the guessed metres per unit."""
     extents = np.ptp(vertices[faces.reshape(-1)], axis=0)
     longest = float(extents.max())
     units = plausible_units(longest) or plausible_units(longest, BONE_SIZE)

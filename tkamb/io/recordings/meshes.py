@@ -28,21 +28,21 @@ BONE_SIZE = (0.010, 0.650)
 """m; accepted lengths of a bone at the knee, whole or in part."""
 
 
-# m: smallest component with two condyles. Chosen because real ones are at least 50 mm wide.
+# m: smallest component with two condyles. Real ones are at least 50 mm wide.
 MIN_SIZE = 0.034
-# m: coarser rounding of coordinates gets a notice. Chosen because forces then change by about 0.5
+# m: coarser rounding of coordinates gets a notice. Forces then change by about 0.5
 # %.
 ROUNDING_NOTICE = 1e-6
-# m: a mesh with coarser rounding of coordinates is refused. Chosen because 8 µm change forces by 4
+# m: a mesh with coarser rounding of coordinates is refused. 8 µm change forces by 4
 # %.
 ROUNDING_LIMIT = 5e-6
-# Number of bytes in which a file's space is searched. Chosen because headers are shorter.
+# Number of bytes in which a file's space is searched. Headers are shorter.
 HEADER_BYTES = 4096
 # 1: area of the wall between touching bodies, in the plan view, from which one body lies on the
-# other, as a share of the part's extents. Chosen: a post covers less, a tray more.
+# other, as a share of the part's extents. A post covers less, a tray more.
 STACKED_SHARE = 0.3
 # 1: widest hole of a part, as a share of its length. A part with a wider hole is an open sheet.
-# Chosen because holes of damaged files are smaller.
+# Holes of damaged files are smaller.
 SHEET_OPENING = 1.0 / 3.0
 
 
@@ -101,7 +101,6 @@ def load_surface(
     repaired (`tkamb.geometry.repair`), with one warning on the logger "tkamb".
 
     Args:
-        path: the file.
         unit: unit of length of the file, "m", "cm", "mm" or "inch".
         axes: axes of the file that point anterior, superior and to the right.
         name: name of the part, for messages.
@@ -297,7 +296,6 @@ def _check_stacked(
     Args:
         mended: the part.
         wall: its inner wall.
-        path: its file.
         name: name of the part.
         up: (3,) superior direction in the file's axes.
         unit: unit of the file.

@@ -48,7 +48,7 @@ FARTHEST_MM = (-200, 200)
 hand's breadth of the insert, and the patella within a hand's breadth of the femoral origin."""
 
 
-# deg: largest rotation of the patella against the femur, in either direction. Chosen because no
+# deg: largest rotation of the patella against the femur, in either direction. No
 # patella turns by half a turn.
 MAX_ROTATION_DEG = 180
 
@@ -81,7 +81,6 @@ class KneeMotion:
         unrecorded: coordinates without a column; they are zero.
         odd: samples off their neighbours' curve.
         markers: kinematics by skin markers, if the motion comes from markers.
-        remarks: notices on the file.
     """
 
     time: Array
@@ -161,7 +160,6 @@ def load_motion(
 def _from_markers(
     source: MotionTable, side: Side, insert: Array, released: Sequence[str]
 ) -> KneeMotion:
-    """Return the motion from skin markers, with the coordinates that [motion.markers] names."""
     from tkamb.io.recordings.marker_motion import load_marker_motion
 
     assert source.markers is not None
@@ -279,7 +277,6 @@ def _check_knee(knee: Array, path: Path, bending: str | None = None) -> None:
 
 
 def _check_patella(patella: Array, path: Path) -> None:
-    """Raise an InputError if the patella's coordinates (n, 3) are impossible."""
     turn = (-MAX_ROTATION_DEG, MAX_ROTATION_DEG)
     for name, values, limits, unit, key in (
         ("patella_ap", patella[:, 0] / MILLIMETRE, FARTHEST_MM, "mm", "length_unit"),
@@ -305,7 +302,6 @@ def _find_odd_steps(time: Array, values: Array, path: Path) -> tuple[OddSample, 
 def _differentiate(
     time: Array, knee: Array, patella: Array | None, source: MotionTable, path: Path
 ) -> KneeMotion:
-    """Return the filtered motion at the scene's frames."""
     values = knee if patella is None else np.concatenate([knee, patella], axis=1)
     cycle = None
     if source.cycle_s:

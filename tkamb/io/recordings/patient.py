@@ -112,11 +112,11 @@ def combined(first: RigidInertia, second: RigidInertia) -> RigidInertia:
 
 # kg: mass of the patella, at its link's origin, if the URDF states none (assumed).
 MASS = 0.1
-# m: radius of gyration of this mass about any axis. Chosen because it is about that of a disc of
+# m: radius of gyration of this mass about any axis. It is about that of a disc of
 # 40 mm diameter and 20 mm thickness.
 RADIUS_OF_GYRATION = 0.015
 # 1: largest distance of a link's far end from the link's y axis (up), as a share of the link's
-# length. Chosen because a link with a larger distance does not lie along its y axis.
+# length. A link with a larger distance does not lie along its y axis.
 MAX_LATERAL_SHARE = 0.5
 
 
@@ -267,7 +267,6 @@ def _segment(
 
 
 def _fixed_pose(robot: ElementTree.Element, link: str, base: str, path: Path) -> Array:
-    """Return the pose of `link` in `base`, which must be joined to it by fixed joints."""
     parents = {joint.find("child").get("link"): joint for joint in robot.findall("joint")}  # type: ignore[union-attr]
     result, name = np.eye(4), link
     while name != base:

@@ -12,11 +12,11 @@ import numpy as np
 from tkamb.geometry.frames import Array
 from tkamb.units import LENGTH
 
-# N: vertical force above which the centre of pressure is checked. Chosen because a smaller force
+# N: vertical force above which the centre of pressure is checked. A smaller force
 # makes it a quotient of small numbers.
 LOADED_N = 100.0
 # 1: share of the plate's half width by which the median centre of pressure may lie outside the
-# corners. Chosen because a loaded plate has smaller errors.
+# corners. A loaded plate has smaller errors.
 BESIDE = 0.2
 # 1: if 95 % of the centres of pressure are closer to the transducers' origin than this share of
 # both half widths, below a millimetre, the moments are too small. A foot's centre of pressure

@@ -16,12 +16,12 @@ from tkamb.geometry.frames import Array
 
 # Number of samples on either side for the median deviation. Not studied.
 NEIGHBOURS = 12
-# 1: smallest ratio of an odd sample's deviation to the median. Chosen because normal noise exceeds
+# 1: smallest ratio of an odd sample's deviation to the median. Normal noise exceeds
 # it once in 10 million samples.
 OUTLIER_FACTOR = 8.0
-# s: largest median step between samples. Chosen because slower samples record no movement.
+# s: largest median step between samples. Slower samples record no movement.
 MAX_STEP = 5.0
-# 1: factor on `OUTLIER_FACTOR` at the ends of a recording. Chosen because extrapolation of a cubic
+# 1: factor on `OUTLIER_FACTOR` at the ends of a recording. Extrapolation of a cubic
 # has larger errors than interpolation.
 END_FACTOR = 4.0
 
@@ -31,7 +31,6 @@ class OddSample:
     """A sample off its neighbours' curve.
 
     Args:
-        path: the file.
         what: the quantity, like "flexion".
         time: s, time of the sample.
         away: distance from the curve, in `unit`.
@@ -51,7 +50,6 @@ def odd_samples(
     """Return the odd samples of one quantity.
 
     Args:
-        path: the file, for messages.
         what: the quantity, for messages.
         time: (n,) s, rising.
         values: (n,) SI.
@@ -111,7 +109,6 @@ def check_overlap(path: Path, clock: Array, time: Array, table: str) -> None:
     """Raise an InputError if a measurement and the motion have no common time.
 
     Args:
-        path: the file.
         clock: (n,) s, times of the file's samples on the motion's clock.
         time: (f,) s, times of the motion.
         table: the scene's table that names the file, like "[measured]".

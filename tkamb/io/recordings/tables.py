@@ -4,19 +4,19 @@ import contextlib
 import math
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from tkamb.errors import InputError, names_near
+from tkamb.files import BYTE_ORDER_MARKS, TABLE_BYTES, read_bytes
 from tkamb.geometry.frames import Array
-from tkamb.io.recordings.table_lines import SEPARATORS, read_lines, tab_separated
 from tkamb.io.recordings.unit_words import GivenUnits, metres
 from tkamb.units import LENGTH
 
-# s: largest rounding of the times of a `.trc`. Chosen because cameras write milliseconds.
+# s: largest rounding of the times of a `.trc`. Cameras write milliseconds.
 TRC_TIME_ROUNDING = 1e-3
 # Largest number in any unit. A larger number is refused as no measurement.
 MAX_VALUE = 1e12
@@ -41,7 +41,6 @@ class Table:
     """Named columns of equal length, in the units of the file.
 
     Args:
-        path: the file.
         columns: name -> (n,) values. A marker M of `.trc` or `.c3d` has columns M_x, M_y, M_z.
         length_unit: unit of length that the file states (`.trc`, `.c3d`), else None.
         in_degrees: whether angles are in degrees; None if the file does not state it.
@@ -123,7 +122,6 @@ class Table:
 
         Args:
             length_unit: unit that the scene states; None: the file's header states it.
-            key: the scene's key, for the message.
 
         Raises:
             InputError: neither the scene nor the file states a unit, or they state different ones.
@@ -146,7 +144,6 @@ def read_table(path: Path, format: str | None = None) -> Table:
     """Read a table.
 
     Args:
-        path: the file.
         format: a name of `READERS`; by default the suffix.
 
     Raises:
@@ -258,7 +255,6 @@ def read_storage(path: Path) -> Table:
 
 
 def _row_notices(stated: str | None, rows: int) -> tuple[str, ...]:
-    """Return a remark if the header states another number of rows."""
     if stated is None or not stated.isdecimal() or int(stated) == rows:
         return ()
     return (f"has {rows} rows, but its header says {int(stated)}; it may be cut short",)
@@ -463,3 +459,57 @@ READERS: dict[str, Callable[[Path], Table]] = {
     "c3d": read_c3d_markers,
 }
 """Name of a format, which is the file's suffix -> reader."""
+
+
+SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
+"""Separator of cells -> its name in notices."""
+
+
+def read_lines(path: Path) -> list[str]:
+    """Return the lines of a text file.
+
+    A byte order mark decides the encoding; without one it is UTF-8. If the bytes are not valid
+    UTF-8, it is Latin-1, which older programs write.
+
+    Raises:
+        InputError: no such file, or larger than a table may be.
+    """
+    content = read_bytes(path, TABLE_BYTES)
+    encodings = [name for mark, name in BYTE_ORDER_MARKS.items() if content.startswith(mark)]
+    try:
+        text = content.decode((encodings or ["utf-8"])[0])
+    except UnicodeDecodeError:
+        text = content.decode("latin-1")
+    return text.replace("\r\n", "\n").replace("\r", "\n").splitlines()
+
+
+def tab_separated(lines: Sequence[str], header: int) -> tuple[list[str], list[str]]:
+    """Return the lines with tabs between the cells, and a notice for each change.
+
+    Args:
+        header: index of the line with the names of the columns. If it holds no tab, its commas or
+            semicolons are the separators of all lines.
+    """
+    notices = []
+    result = list(lines)
+    if any('"' in line for line in result):
+        result = [line.replace('"', "") for line in result]
+        notices.append("has quotes around its cells; they are left out")
+    names = result[header] if header < len(result) else ""
+    for separator in (",", ";"):
+        if separator in names and "\t" not in names.strip():
+            word = SEPARATORS[separator]
+            result = [line.replace("\t", " ").replace(separator, "\t") for line in result]
+            notices.append(f"has {word} between its cells, and is read so")
+            break
+    rows = [line for line in result[header + 1 :] if line.strip()]
+    # A row whose first cell is a frame without a number has the time in the second cell.
+    # The line of a .trc with the axes, like X1 Y1 Z1, is no row.
+    numbers = [line for line in rows if not re.match(r"\s*[A-Za-z]", line)]
+    if rows and all(re.match(r"\t\d+\t", line) for line in numbers):
+        result = [
+            line[1:] if k > header and re.match(r"\t\d+\t", line) else line
+            for k, line in enumerate(result)
+        ]
+        notices.append("has a tab before each row; it is left out")
+    return [line.lstrip("\t") if k <= header else line for k, line in enumerate(result)], notices

@@ -29,16 +29,16 @@ from tkamb.io.recordings.samples import (
 from tkamb.io.recordings.tables import Table, read_table
 from tkamb.units import DEGREE, MILLIMETRE
 
-# deg: largest lean of a shank from the vertical, in either direction. Chosen because a sprinter's
+# deg: largest lean of a shank from the vertical, in either direction. A sprinter's
 # shank swings back by 110 deg.
 MAX_LEAN_DEG = 150.0
-# m: largest distance from the laboratory's origin. Chosen because it is beyond the view of any
+# m: largest distance from the laboratory's origin. It is beyond the view of any
 # camera.
 MAX_DISTANCE = 100.0
-# m: distance from the ankle to the proximal point that is checked. Chosen because it is about the
+# m: distance from the ankle to the proximal point that is checked. It is about the
 # length of an adult's shank.
 SHANK_LENGTH = 0.4
-# s: time before and after the frames in which samples are checked. Chosen because the filter's
+# s: time before and after the frames in which samples are checked. The filter's
 # response is several times shorter.
 WINDOW = 0.5
 
@@ -63,7 +63,6 @@ class BodyMotion:
         residual: (f,) m, root mean square distance of the marker fit before filtering; None
             without a marker fit.
         odd: samples around the frames that lie off their neighbours' curve.
-        remarks: notices on the file.
     """
 
     time: Array
@@ -84,7 +83,6 @@ def load_tibia(source: TibiaTable, time: Array, side: Side, cutoff_Hz: Cutoff) -
     Args:
         source: the scene's [tibia].
         time: (f,) s of the frames, on the file's clock.
-        side: side of the knee.
         cutoff_Hz: cut-off of the motion, used if `source` states none.
 
     Raises:

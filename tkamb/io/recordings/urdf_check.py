@@ -63,11 +63,11 @@ _MANY = {"visual", "collision"}
 _TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 _ANKLE_JOINT = "ankle"
 _AXIS_ROUNDING = 1e-6
-"""1: largest difference of a unit axis from its nominal axis that counts as rounding. Chosen as
-programs write six digits. The nominal axis replaces it."""
+"""1: largest difference of a unit axis from its nominal axis that counts as rounding.
+Programs write six digits. The nominal axis replaces it."""
 
 
-# rad: a larger angle is assumed to be in degrees. Chosen because angles in a URDF are below one
+# rad: a larger angle is assumed to be in degrees. Angles in a URDF are below one
 # turn.
 MAX_ANGLE = 8.0 * np.pi
 
@@ -202,7 +202,6 @@ def check_chain(
 
     Args:
         robot: tree of a right leg, or of a mirrored left leg.
-        path: path of the file, for messages.
         side: declared side of the knee, for messages.
         with_patella: whether the patella is required; if not, it is checked if present.
     """
@@ -318,8 +317,6 @@ def check_inertia(link: ElementTree.Element, path: Path, needed: bool) -> None:
     """Raise an InputError unless mass and inertia are possible for a body.
 
     Args:
-        link: the link.
-        path: path of the file, for messages.
         needed: whether the link must have a mass; otherwise zero is accepted.
     """
     inertial = link.find("inertial")

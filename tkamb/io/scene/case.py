@@ -42,7 +42,6 @@ class Case:
     """The input of a run. Parts that are absent from the scene are None.
 
     Args:
-        scene: the scene of the file.
         chain: kinematic chain of the patient.
         motion: coordinates of the knee, and of a recorded patella, per frame.
         tibia: motion of the shank in the laboratory; None: the shank is upright and does not move.
@@ -52,8 +51,6 @@ class Case:
         patella: patellar button in the patella link's frame.
         ligaments: the bundles, including generic ones; the slack length is NaN if the scene does
             not state it.
-        muscles: the muscles.
-        patellar_ligament: the patellar ligament.
         measured: forces that an instrumented implant measured.
         emg: envelopes of the muscles' surface EMG.
         post: the insert's post in the insert frame, if the scene has [contact] post.
@@ -151,7 +148,6 @@ class Case:
 def _recordings(
     scene: Scene, source: MotionTable, chain: Chain, parts: ImplantParts | None
 ) -> "tuple[KneeMotion, BodyMotion | None, GroundReaction | None]":
-    """Return knee, shank and ground reaction at the frames of the motion."""
     released = scene.contact.released if scene.contact else ()
     motion = load_motion(
         source,

@@ -39,7 +39,6 @@ class ImplantParts:
     Parts that the scene does not need are None.
 
     Args:
-        scene: the scene.
         insert_alone: whether the insert is the only part to read.
     """
 
@@ -86,7 +85,6 @@ class ImplantParts:
             self.patella, _ = self._place("patellar button", implant.patella)
 
     def _place_insert(self, scene: Scene) -> "Surface":
-        """Return the insert in the insert frame, and store the pose of its mesh."""
         from tkamb.geometry.flat_bottom import insert_placement
         from tkamb.io.recordings.meshes import axes_rotation, load_surface
 
@@ -108,7 +106,6 @@ class ImplantParts:
         return self._right(surface.moved(placement))
 
     def _could_be_insert(self, table: FemoralImplantTable) -> bool:
-        """Return whether the mesh of [implant.femoral] has the flat bottom of an insert."""
         from tkamb.geometry.flat_bottom import insert_placement
         from tkamb.io.recordings.meshes import axes_rotation, load_surface
 

@@ -196,7 +196,6 @@ def with_preset(scene: Scene, preset: str, overrides: dict[str, Any] | None = No
     """Return a scene with a preset applied. The scene's overrides stay.
 
     Args:
-        scene: the scene.
         preset: name of a preset (`tkamb.io.presets`).
         overrides: dotted key -> value that replaces the preset's value.
 
@@ -227,7 +226,6 @@ def with_overrides(scene: Scene, overrides: dict[str, Any]) -> Scene:
 
 
 def _changed(content: dict[str, Any], overrides: dict[str, Any]) -> Scene:
-    """Return the scene of a scene file's content, after overrides are applied to the content."""
     _apply_overrides(content, overrides)
     try:
         result = Scene.model_validate(content)
@@ -327,7 +325,8 @@ def _complaint(error: ValidationError, path: Path, overrides: dict[str, Any]) ->
     where = path if option is None else f"overrides {option}"
     more = f" ({len(result) - 1} more after this one)" if len(result) > 1 else ""
     if first["type"] == "extra_forbidden":
-        keys = list(_keys_of(first["loc"][:-1]))
+        model = _model_at(first["loc"][:-1])
+        keys = [] if model is None else list(model.model_fields)
         advice = names_near(str(first["loc"][-1]), keys)
         return InputError(f"unknown key '{key}'", where, f"{advice}{_tables_with(first)}{more}")
     advice = f"`tkamb scene --schema` lists every key{more}"
@@ -359,12 +358,6 @@ def _shown(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     return f'"{value}" in quotes' if isinstance(value, str) else str(value)
-
-
-def _keys_of(place: tuple[int | str, ...]) -> tuple[str, ...]:
-    """Return the keys of the table at a place of the scene."""
-    model = _model_at(place)
-    return () if model is None else tuple(model.model_fields)
 
 
 def _model_at(place: tuple[int | str, ...]) -> type[BaseModel] | None:

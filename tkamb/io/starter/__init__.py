@@ -20,7 +20,6 @@ def lay_out(directory: Path, person: "Person | None" = None) -> Path:
     The folder is written completely or not at all.
 
     Args:
-        directory: the folder.
         person: the patient; None: a man of 75 kg and 1.75 m, right knee.
 
     Raises:

@@ -45,13 +45,13 @@ class LegProportionSettings:
     """m: height of the femoral component's origin above the knee's centre, as in the shipped
     patient."""
     lightest: float = 20.0
-    """kg: smallest accepted mass. Chosen because it excludes masses in other units."""
+    """kg: smallest accepted mass. It excludes masses in other units."""
     heaviest: float = 300.0
-    """kg: greatest accepted mass. Chosen because it excludes masses in other units."""
+    """kg: greatest accepted mass. It excludes masses in other units."""
     shortest: float = 1.0
-    """m: smallest accepted height. Chosen because it excludes heights in other units."""
+    """m: smallest accepted height. It excludes heights in other units."""
     tallest: float = 2.3
-    """m: greatest accepted height. Chosen because it excludes heights in other units."""
+    """m: greatest accepted height. It excludes heights in other units."""
 
 
 LEG_PROPORTIONS = LegProportionSettings()
@@ -62,7 +62,6 @@ class Person:
     """A patient for the files of `tkamb new`.
 
     Args:
-        side: side of the knee.
         mass: body mass, kg.
         height: body height, m.
         sex: "female" or "male", which selects the table of de Leva (1996).
@@ -110,7 +109,6 @@ def write_person(folder: Path, person: Person) -> None:
 
     Args:
         folder: folder with the files of `tkamb new`.
-        person: the patient.
     """
     urdf, scene = folder / "patient.urdf", folder / "scene.toml"
     urdf.write_text(patient_urdf(urdf.read_text(encoding="utf-8"), person), encoding="utf-8")

@@ -105,7 +105,6 @@ class KneeTrial:
         The solution has the form of `FrameProblems.solved`.
 
         Args:
-            k: index of the frame.
             moment: moment of muscles and reserve at the knee, N·m.
             extensor_arm: moment arm of the extensor group, m.
             arms: moment arms of the crossing muscles, m, (c,).
@@ -148,10 +147,8 @@ def knee_trial(
     """Return the muscles of a leg over a motion, for tkamb's knee with its own patella.
 
     Args:
-        links: links of the leg.
         motion: coordinates of the OpenSim model over time.
         loads: name of a body -> external wrenches, (f, 6), as in `solve_trial`.
-        sharing: options.
 
     Raises:
         InputError: no muscle ends on or passes the patella, or any error of `solve_trial`.
@@ -218,7 +215,6 @@ class LegRecording:
 
     Args:
         model: path of the .osim file.
-        side: side of the knee.
         coordinates: path of a .mot or .sto file of the model's coordinates; None: the coordinates
             are fitted to the markers.
         markers: path of a marker recording; None: no markers.
@@ -228,7 +224,6 @@ class LegRecording:
         insert_placement: pose of the insert's mesh in the insert frame, (4, 4), see `find_links`;
             None: no implant.
         mesh_axes: axes of the mesh that point anterior, superior and right.
-        sharing: options.
         points: segment -> label -> position of a marker, m, (3,), where it differs from the
             model's, see `placed_markers`.
     """
@@ -250,7 +245,6 @@ def load_knee_trial(source: LegRecording, time: Array) -> tuple[Links, KneeTrial
     """Return the links of a leg in the bodies of its model, and the trial at some times.
 
     Args:
-        source: files and options.
         time: times of the frames on the clock of the recordings, s, (f,).
 
     Raises:
@@ -275,7 +269,6 @@ def group_names(model: Path, side: Side) -> tuple[str, ...]:
 
     Args:
         model: path of the .osim file.
-        side: side of the leg.
 
     Raises:
         InputError: the model cannot be used.

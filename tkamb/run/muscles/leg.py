@@ -40,8 +40,8 @@ VELOCITY = (-0.3211346127989808, -8.149, -0.374, 0.8825327733249912)
 PASSIVE_SHAPE = 4.0
 # 1: strain beyond the optimal length at which the passive force is F_max.
 PASSIVE_STRAIN = 0.6
-# 1: largest fibre length over the optimal length for which the curves are valid. Chosen because
-# the passive force at 1.6 is F_max already.
+# 1: largest fibre length over the optimal length for which the curves are valid.
+# The passive force at 1.6 is F_max already.
 LONGEST_FIBRE_RATIO = 1.8
 
 
@@ -109,7 +109,7 @@ GROUPS = {
 
 
 # 1 or m: largest relative difference of strength and lengths, and largest distance of points.
-# Chosen because the rounding of files is smaller.
+# The rounding of files is smaller.
 TOLERANCE = 1e-6
 
 
@@ -141,8 +141,8 @@ def leg_coordinates(leg: Leg) -> tuple[str, ...]:
     return (*free(leg.hip), leg.flexion, *free(leg.ankle), *(c for j in below for c in free(j)))
 
 
-# N·m: size of the reserve of the hip's coordinates, so large that it costs nothing. Chosen because
-# the abductors of scaled models are too weak for the moments of inverse dynamics. With 10 N·m the
+# N·m: size of the reserve of the hip's coordinates, so large that it costs nothing.
+# The abductors of scaled models are too weak for the moments of inverse dynamics. With 10 N·m the
 # muscles that cross hip and knee supply them, and the knee's load is too large (docs/truth.md).
 AT_HIP = 1e4
 # N·m: size at knee, ankle and subtalar joint, as usual in static optimisation.

@@ -33,7 +33,7 @@ class SharedMuscleSettings:
     """Muscles of a leg with tkamb's knee."""
 
     max_offset: float = 0.5 * MILLIMETRE
-    """m: largest distance of insert and hip between URDF and muscle model. Chosen because the
+    """m: largest distance of insert and hip between URDF and muscle model. The
     rounding of the two files is smaller."""
     max_iterations: int = 8
     """1: largest number of iterations, each with muscle forces for the condyles lifted so far. A
@@ -93,7 +93,6 @@ class FrameMuscles:
 
     Args:
         trial: optimisation problems and muscle lines of all frames.
-        k: index of the frame.
         lines: muscle lines across the knee in this frame.
     """
 

@@ -293,8 +293,8 @@ class EmgGuide:
         )
 
 
-# 1: largest relative violation of the optimality conditions. Beyond it the frame fails. Chosen
-# because the solver's residuals are smaller.
+# 1: largest relative violation of the optimality conditions. Beyond it the frame fails.
+# The solver's residuals are smaller.
 KKT_TOLERANCE = 1e-8
 
 
@@ -357,7 +357,6 @@ class FrameProblems:
     Args:
         muscles: the m muscles.
         coordinates: names of the c balanced coordinates.
-        sharing: options.
         moment: joint moments τ, N·m, (f, c).
         arms: moment arms, m, (f, m, c).
         active: forces at full activation without the passive forces, N, (f, m).

@@ -264,10 +264,8 @@ def trial_problems(
     """Return the optimisation problems of all frames, and the bones with their loads.
 
     Args:
-        leg: leg of the model.
         motion: coordinates of the model over time.
         loads: name of a body -> external wrench, see `solve_trial`.
-        sharing: options.
 
     Raises:
         InputError: no such muscle, coordinate or body, or an option is out of range.

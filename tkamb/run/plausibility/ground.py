@@ -25,14 +25,14 @@ class GroundReactionLimitSettings:
     """Limits of plausible ground reactions."""
 
     max_lateral_distance: float = 0.075
-    """m: largest distance of the centre of pressure from the ankle to either side. Chosen as
-    half the breadth of a shoe, doubled to allow for an oblique foot."""
+    """m: largest distance of the centre of pressure from the ankle to either side.
+    Half the breadth of a shoe, doubled to allow for an oblique foot."""
     loaded_share: float = 0.2
-    """1: share of the peak force above which a frame is checked. Chosen because the centre of
+    """1: share of the peak force above which a frame is checked. The centre of
     pressure is a quotient of small numbers at smaller forces."""
     min_lean: float = 0.03
     """1: least standard deviation of the ratio of forward to upward force that is compared with
-    the leg's inclination. Chosen because the signs of smaller inclinations are uncertain."""
+    the leg's inclination. The signs of smaller inclinations are uncertain."""
     max_outward_lean: float = 0.02
     """1: largest outward over upward force. Six recordings of standing, walking and squatting have
     0.04 to 0.07 inwards. Subject JW on stairs has 0.007 outwards."""
@@ -51,10 +51,10 @@ class GroundReactionLimitSettings:
     """s: longest time without force on a standing foot. Four recorded walks have at most 0.02 s.
     A missing force plate causes 0.4 s."""
     unloaded_force: float = 0.05
-    """BW: force below which a foot is unloaded. Chosen because the noise of force plates is
+    """BW: force below which a foot is unloaded. The noise of force plates is
     smaller."""
     max_peak_ratio: float = 1.6
-    """1: largest ratio of the peak forces of one foot in a walk. Chosen because three recordings
+    """1: largest ratio of the peak forces of one foot in a walk. Three recordings
     have 1.1."""
 
 

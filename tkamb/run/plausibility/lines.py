@@ -24,14 +24,14 @@ class LineLimitSettings:
     """1: largest strain of a ligament. Ligaments of the knee tear at 0.12 to 0.20 (Kennedy et al.
     1976, Butler et al. 1986)."""
     min_strain: float = -0.4
-    """1: least value of a ligament's largest strain in the motion. Chosen because a bundle with
+    """1: least value of a ligament's largest strain in the motion. A bundle with
     smaller strains has no effect in the motion."""
     max_attachment_distance: float = 0.16
-    """m: largest distance of an attachment from the origin of insert or link. Chosen because the
+    """m: largest distance of an attachment from the origin of insert or link. The
     superficial MCL, the farthest, ends 0.06 to 0.12 below the insert."""
     max_overlap: float = 0.03
     """m: largest height of a tibial end above the insert's bottom, and of a femoral end below the
-    flexion axis. Chosen because the ends in a knee overlap by less."""
+    flexion axis. The ends in a knee overlap by less."""
     min_anterior_offset: float = 0.01
     """m: least distance of the quadriceps origin in front of the line from hip to knee. Three
     models have 0.029 to 0.044."""
@@ -39,7 +39,7 @@ class LineLimitSettings:
     """m: largest distance of quadriceps insertion and patellar ligament from the patella's origin.
     A patella is 0.045 long."""
     max_tendon_change: float = 0.15
-    """1: largest change of the patellar ligament's length, relative to the mean. Chosen because its
+    """1: largest change of the patellar ligament's length, relative to the mean. Its
     strain is a few per cent."""
 
 
@@ -128,16 +128,6 @@ def stiffness_questions(case: Case) -> Iterator[Question]:
             )
 
 
-def torn_bundles(ligaments: "Sequence[Ligament]", tensions: Mapping[str, float]) -> list[str]:
-    """Return the bundles with a tension, N, above the tension at `max_strain`."""
-    return [
-        bundle.name
-        for bundle in ligaments
-        if tensions.get(bundle.name, 0.0)
-        > float(bundle.force((1.0 + LINE_LIMITS.max_strain) * bundle.slack_length))
-    ]
-
-
 def strain_questions(
     ligaments: "Sequence[Ligament]", strains: Mapping[str, Array], time: Array
 ) -> Iterator[Question]:
@@ -182,7 +172,6 @@ def extensor_questions(case: Case, poses: Mapping[str, Array]) -> Iterator[Quest
     """Ask about the ends of quadriceps and patellar ligament, and the patellar ligament's length.
 
     Args:
-        case: the case.
         poses: link -> pose_link_in_insert, (f, 4, 4).
     """
     ligament = case.patellar_ligament

@@ -28,7 +28,7 @@ class MovementLimitSettings:
     """Limits of plausible movements."""
 
     max_flexion_as_radians: float = 3.3
-    """deg: largest flexion that suggests radians in the file. Chosen because 190 deg in radians is
+    """deg: largest flexion that suggests radians in the file. 190 deg in radians is
     the number 3.3."""
     max_marker_residual: float = 12.0 * MILLIMETRE
     """m: largest root mean square residual of the markers in the median frame. Skin moves by up to
@@ -218,7 +218,7 @@ class SignSettings:
     """Criteria for a question about the sign of a coordinate."""
 
     frames: int = 15
-    """1: number of checked frames, evenly spread over the motion. Chosen because more frames change
+    """1: number of checked frames, evenly spread over the motion. More frames change
     the standard deviations by a few per cent only."""
     ap_spread: float = 0.6 * MILLIMETRE
     """m: standard deviation of the mean gap from which the sign of AP is checked. Fluoroscopy of
@@ -228,7 +228,7 @@ class SignSettings:
     0.25 for subject DM with the wrong sign."""
     turn_spread: float = 0.1 * MILLIMETRE
     """m: standard deviation of the difference of the condyles' gaps from which the signs of axial
-    rotation and adduction are checked. Chosen because a mesh of 1 mm facets causes 0.05 mm."""
+    rotation and adduction are checked. A mesh of 1 mm facets causes 0.05 mm."""
     turn_share: float = 0.7
     """1: largest ratio of `turn_spread`'s standard deviation with inverted to recorded sign. It is
     0.43 to 0.62 for subject DM with a wrong sign, and at least 1.6 with right signs."""
@@ -240,7 +240,8 @@ SIGN = SignSettings()
 def sign_questions(case: Case, settings: SignSettings | None = None) -> Iterator[Question]:
     """Ask about the signs of AP, axial rotation and adduction of the recorded poses."""
     settings = SignSettings() if settings is None else settings
-    free = _found_by_contact(case)
+    contact = case.scene.contact
+    free = set(KNEE_COORDINATES) if contact is None else set(contact.released)
     if case.femoral is None or case.insert is None or {"ap", "axial_rotation"} <= free:
         return
     coordinates = case.motion.coordinates
@@ -281,12 +282,6 @@ def sign_questions(case: Case, settings: SignSettings | None = None) -> Iterator
             '["axial_rotation"], or that of its rotation',
             "sign of axial rotation or adduction may be turned",
         )
-
-
-def _found_by_contact(case: Case) -> set[str]:
-    """Return the released coordinates; all coordinates for a scene without contact."""
-    contact = case.scene.contact
-    return set(KNEE_COORDINATES) if contact is None else set(contact.released)
 
 
 def _gaps(clearance: "FirstTouch", coordinates: Array) -> Array:

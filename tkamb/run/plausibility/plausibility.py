@@ -8,7 +8,7 @@ import numpy as np
 
 from tkamb.errors import InputError
 from tkamb.io.scene.case import Case
-from tkamb.run.plausibility import Question, some
+from tkamb.run.plausibility import Question, lines, some
 from tkamb.run.plausibility.ground import (
     direction_questions,
     foot_questions,
@@ -47,10 +47,6 @@ FORCE_LIMITS = ForceLimitSettings()
 class Plausibility:
     """The questions of a case.
 
-    Args:
-        case: the case.
-        recording: knee and motion of the case.
-
     Attributes:
         questions: questions without an answer in the scene.
         answered: sentences with a question and its answer.
@@ -60,7 +56,13 @@ class Plausibility:
     """
 
     def __init__(self, case: Case, recording: "Recording") -> None:
-        self._case, self._recording = case, recording
+        self._case = case
+        stretch = 1.0 + lines.LINE_LIMITS.max_strain
+        self._tear = {
+            bundle.name: float(bundle.force(stretch * bundle.slack_length))
+            for bundle in recording.ligaments
+        }
+        """Bundle -> tension at the largest plausible strain, N."""
         result = [
             *segment_questions(case),
             *motion_questions(case),
@@ -84,13 +86,11 @@ class Plausibility:
         words = [
             question.flag for question in self.questions if question.flag and question.concerns(k)
         ]
-        if self._recording.ligaments:
-            from tkamb.run.plausibility.lines import LINE_LIMITS, torn_bundles
-
-            if torn := torn_bundles(self._recording.ligaments, frame.geometry.tensions):
-                words.append(
-                    f"ligament strain above {100 * LINE_LIMITS.max_strain:.0f} %: {some(torn)}"
-                )
+        tensions = frame.geometry.tensions
+        if torn := [name for name, most in self._tear.items() if tensions.get(name, 0.0) > most]:
+            words.append(
+                f"ligament strain above {100 * lines.LINE_LIMITS.max_strain:.0f} %: {some(torn)}"
+            )
         force = float(np.linalg.norm(frame.loads.contact_force)) / self._case.body_weight
         if force > FORCE_LIMITS.max_force_BW:
             words.append(f"contact force of {force:.1f} BW, above all forces measured in knees")
@@ -103,7 +103,6 @@ def _answered(
     """Return the questions without an answer, and a sentence for each answered question.
 
     Args:
-        questions: all questions of the scene.
         answers: some words of a question -> its answer.
     """
     unanswered, text = list(questions), []
@@ -123,7 +122,6 @@ def _answered(
 
 
 def _line_questions(case: Case, recording: "Recording") -> list[Question]:
-    from tkamb.run.plausibility import lines
     from tkamb.run.read_scene import link_poses
 
     result = [*lines.attachment_questions(case), *lines.stiffness_questions(case)]

@@ -25,10 +25,10 @@ class SegmentLimitSettings:
     reciprocal. The ratio is up to 1.35 between cadaver studies, up to 1.3 with obesity, and 2.2 for
     pounds that are read as kilograms."""
     max_patella_offset: float = 0.05
-    """m: largest distance of the patella's centre of mass from its origin. Chosen because a patella
+    """m: largest distance of the patella's centre of mass from its origin. A patella
     is smaller."""
     max_insert_rotation: float = 20.0 * DEGREE
-    """rad: largest rotation of the insert in the tibia. Chosen because the slope is up to 10 deg,
+    """rad: largest rotation of the insert in the tibia. The slope is up to 10 deg,
     and definitions of the tibia's axes differ."""
     max_centre_offset: float = 0.12
     """1: largest distance of a segment's centre of mass from its axis, as a share of its length.
@@ -104,7 +104,6 @@ def segment_questions(case: Case) -> Iterator[Question]:
 
 
 def _of_patella(case: Case) -> Iterator[Question]:
-    """Ask about mass, centre of mass and inertia of the patella."""
     mass, centre, tensor = case.chain.segment("patella")
     radii = np.sqrt(np.linalg.eigvalsh(tensor) / mass)
     if radii[0] < PATELLA_RADII[0] or radii[-1] > PATELLA_RADII[1]:
@@ -159,7 +158,7 @@ class ImplantShapeLimitSettings:
 
     flange_height_share: float = 0.15
     """1: share of the femoral component's height, from the top, that is searched for the flange.
-    Chosen because the posterior condyles end below."""
+    The posterior condyles end below."""
     min_flange_position: float = 0.35
     """1: least position of the component's top from its posterior end, as a share of its length.
     Eleven components have 0.92 to 0.97, one without a flange has 0.5, and a component that is back
@@ -185,7 +184,7 @@ class ImplantShapeLimitSettings:
     dry joints 0.2."""
     outline_offset: float = 0.25
     """1: distance from the middle to the compared outlines of an insert, as a share of its width.
-    Chosen because the condyles are there."""
+    The condyles are there."""
 
 
 IMPLANT_SHAPE_LIMITS = ImplantShapeLimitSettings()
@@ -278,13 +277,11 @@ def _of_button(button: "Surface") -> Iterator[Question]:
 
 
 def _centroid(surface: "Surface") -> Array:
-    """Return the centroid (3,) of a surface's area."""
     middles, areas = surface.triangles.mean(axis=1), surface.areas
     return np.asarray(areas @ middles / areas.sum())
 
 
 def _way(direction: Array) -> str:
-    """Return the word for the anatomical direction nearest to a vector (3,)."""
     axis = int(np.abs(direction).argmax())
     return (("backward", "forward"), ("downward", "upward"), ("medially", "laterally"))[axis][
         int(direction[axis] > 0.0)

@@ -40,40 +40,40 @@ class BenchLimitSettings:
     """Ranges of the sliders of `tkamb live`."""
 
     flexion_deg: tuple[float, float] = (-20.0, 160.0)
-    """deg: smallest and largest flexion. Chosen because a scene accepts them even if a component is
+    """deg: smallest and largest flexion. A scene accepts them even if a component is
     rotated by `placement_deg`, so every state can be saved."""
     adduction_deg: float = 20.0
     """deg: largest varus or valgus. Chosen for the same reason as `flexion_deg`."""
     axial_rotation_deg: float = 60.0
     """deg: largest internal or external rotation. Chosen for the same reason as `flexion_deg`."""
     length_mm: float = 60.0
-    """mm: largest translation of the femur. Chosen because the femur is then beside the insert."""
+    """mm: largest translation of the femur. The femur is then beside the insert."""
     placement_deg: float = 20.0
-    """deg: largest change of a component's orientation. Chosen because surgical errors are below
+    """deg: largest change of a component's orientation. Surgical errors are below
     it."""
     placement_mm: float = 20.0
-    """mm: largest change of a component's position. Chosen because surgical errors are smaller."""
+    """mm: largest change of a component's position. Surgical errors are smaller."""
     load_N: float = 15_000.0
-    """N: largest axial load. Chosen because load and weight of the shank together are below the
+    """N: largest axial load. Load and weight of the shank together are below the
     largest force that a scene accepts from a force plate."""
     slack_percent: float = 20.0
-    """%: largest increase or decrease of the ligaments' slack lengths. Chosen because ligaments of
+    """%: largest increase or decrease of the ligaments' slack lengths. Ligaments of
     the knee rupture at strains of 12 to 20 %."""
     finest_mm: float = 0.5
-    """mm: smallest spacing of the map. Chosen because a finer map cannot follow a slider."""
+    """mm: smallest spacing of the map. A finer map cannot follow a slider."""
     coarsest_mm: float = 10.0
-    """mm: largest spacing of the map. Chosen equal to the limit in `MapGridSettings`."""
+    """mm: largest spacing of the map. Equal to the limit in `MapGridSettings`."""
     thickness_mm: tuple[float, float] = (4.0, 25.0)
-    """mm: smallest and largest thickness of a parametric insert. Chosen because inserts are sold
+    """mm: smallest and largest thickness of a parametric insert. Inserts are sold
     with 6 to 20 mm."""
     kept_models: int = 8
-    """Number of prepared contact models that stay in memory. Chosen because a lattice takes 0.1 to
+    """Number of prepared contact models that stay in memory. A lattice takes 0.1 to
     0.5 GB."""
     most_threads: int = 2
-    """Number of contact models that are prepared at the same time. Chosen because the machine must
+    """Number of contact models that are prepared at the same time. The machine must
     still compute the coarse model while a slider moves."""
     first_penetration: float = 5e-5
-    """m: penetration at which a search for released coordinates begins. Chosen equal to
+    """m: penetration at which a search for released coordinates begins. Equal to
     `initial_pose.first_penetration`."""
 
 
@@ -251,7 +251,6 @@ class Bench:
         """Return the static case of a request.
 
         Args:
-            request: state of the bench.
             height: function of the pose that returns y of the femoral origin at first touch, m.
                 The component is placed `first_penetration` below it. None: y follows from si = 0.
             like: case with another insert; None: the case of the scene.
@@ -330,7 +329,6 @@ class Bench:
         return insert @ inverse(request.tibial.matrix()) @ inverse(insert)
 
     def _bundle(self, bundle: "Ligament", request: BenchRequest) -> "Ligament":
-        """Return a bundle after its bones have moved relative to the components."""
         moved = {"femur": inverse(request.femoral.matrix()), "tibia": self._bone(request)}
         return replace(
             bundle.on_links({link: (link, moved.get(link, np.eye(4))) for link in bundle.links}),

@@ -294,7 +294,6 @@ def _contact_lines(knee: Knee) -> list[str]:
 
 
 def _write_obj(path: Path, surface: Surface) -> None:
-    """Write a surface as OBJ, with all digits of its coordinates."""
     lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in surface.vertices.tolist()]
     lines += [f"f {a} {b} {c}" for a, b, c in (surface.faces + 1).tolist()]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

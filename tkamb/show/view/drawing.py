@@ -233,7 +233,6 @@ class Drawing:
     """All objects of the drawing of one run.
 
     Args:
-        title: name of the run and its contact model.
         side: "right" or "left".
         body_weight: body weight, N.
         contact: name of the contact model; empty without contact.
@@ -241,9 +240,7 @@ class Drawing:
         times: times of the frames, s, shape (f,).
         statuses: status of each frame: "ok" or a sentence.
         readings: displayed numbers of every frame.
-        solids: surfaces.
         strands: ligaments, tendons and paths of centres of pressure.
-        arrows: forces.
         markers: contact points and centres of pressure.
         map: pressure map; None without contact.
         strain_limit: upper end of the ligaments' colour scale; 0 without ligaments.

@@ -118,7 +118,6 @@ def _hip(geometry: KneeGeometry) -> Array:
 
 
 def _extensor(results: "Results", geometries: Sequence[KneeGeometry]) -> list[Arrow]:
-    """Return the forces of the tendons, and the force of the femur on the patella."""
     arrows = []
     for name, column, meaning in (
         ("quadriceps", "quadriceps_N", "on the patella"),
@@ -151,7 +150,6 @@ def _distal_end(geometry: KneeGeometry, name: str) -> tuple[Array, Array]:
 
 
 def _patella(geometry: KneeGeometry) -> tuple[Array, Array, Array]:
-    """Return the patellofemoral normal, tangent and contact point."""
     extensor = geometry.extensor
     if extensor is None:
         return NOTHING, NOTHING, NOTHING
@@ -203,12 +201,12 @@ halved if there are more than `many_bundles` bundles."""
 
 # m: radius of a muscle's tube. Chosen by eye.
 MUSCLE_RADIUS = 2.0 * MILLIMETRE
-# N: a tendon or muscle with a smaller force is grey. Chosen because this force is negligible.
+# N: a tendon or muscle with a smaller force is grey. This force is negligible.
 SLACK_FORCE = 1.0
-# 1: smallest upper end of the colour scale of activations. Chosen because small activations then
+# 1: smallest upper end of the colour scale of activations. Small activations then
 # look small.
 LEAST_ACTIVATION = 0.1
-# Number of ligament bundles above which their radius is halved. Chosen because thick bundles would
+# Number of ligament bundles above which their radius is halved. Thick bundles would
 # cover each other.
 MANY_BUNDLES = 20
 

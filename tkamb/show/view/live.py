@@ -244,7 +244,6 @@ class LiveKnee:
         the tolerance of the solver.
 
         Args:
-            request: state of the bench.
             number: number from `overtake`; None: newer requests do not cancel this one.
             from_rest: whether to start without an initial guess, like the first frame of a run.
 
@@ -263,7 +262,6 @@ class LiveKnee:
         """Write a scene for which `tkamb run` gives the same numbers; return its file.
 
         Args:
-            request: state of the bench.
             folder: new or empty folder.
 
         Raises:
@@ -306,7 +304,6 @@ class LiveKnee:
         return self._cases[thickness_mm]
 
     def _recording(self, request: BenchRequest) -> Recording:
-        """Return the prepared contact model of a request, shared by all requests of its setting."""
         key, insert = setting(request), request.thickness_mm
         with self._counting:
             recording = self._recordings.get(key)

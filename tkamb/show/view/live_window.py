@@ -205,7 +205,6 @@ class LiveWindow:
         return self._packed(answer, str(self.knee.save(request, self._next_folder())))
 
     def _next_folder(self) -> Path:
-        """Return the next unused folder."""
         number = 1
         while (self.folder / f"kept-{number}").exists():
             number += 1

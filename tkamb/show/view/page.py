@@ -27,7 +27,7 @@ SIZE = (1280, 720)
 """Width and height of pictures, pixels. MP4 needs even numbers."""
 
 
-# Largest number of frames per second. Chosen because browsers play no GIF faster.
+# Largest number of frames per second. Browsers play no GIF faster.
 MAX_FRAME_RATE = 50.0
 
 
@@ -166,7 +166,7 @@ BROWSERS = (
 SOFTWARE_GRAPHICS = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 
-# s: time limit of the browser. Chosen because a page usually takes some seconds.
+# s: time limit of the browser. A page usually takes some seconds.
 TIMEOUT = 120.0
 
 
@@ -181,7 +181,6 @@ def page_html(
     """Return the HTML page of the viewer.
 
     Args:
-        title: heading.
         packed: drawings (`tkamb.show.view.payload.pack`); None: a server sends them.
         frame: frame at which the page opens.
         view: camera at the beginning.

@@ -44,7 +44,7 @@ from tkamb.show.view.drawing import (
 )
 from tkamb.units import MILLIMETRE
 
-# Largest number of triangles of a drawn surface. A finer surface is decimated. Chosen because a
+# Largest number of triangles of a drawn surface. A finer surface is decimated. A
 # frame of two such surfaces takes less than 100 ms without a graphics card.
 MAX_TRIANGLES = 6_000
 
@@ -115,12 +115,12 @@ def _distance(one: Surface, other: Surface) -> float:
     )
 
 
-# m per body weight: length of a force arrow. Chosen because arrows fit beside the knee.
+# m per body weight: length of a force arrow. Arrows fit beside the knee.
 ARROW_METRES_PER_BODY_WEIGHT = 0.03
-# Number of levels between zero and the largest pressure. Chosen because the levels are then
+# Number of levels between zero and the largest pressure. The levels are then
 # invisible, and a level fits in 16 bits.
 PRESSURE_LEVELS = 32767
-# Largest number of triangles of a surface that shows wear. Chosen because merged triangles blur
+# Largest number of triangles of a surface that shows wear. Merged triangles blur
 # the colours of wear.
 MOST_COLOURED_TRIANGLES = 100_000
 

@@ -11,10 +11,10 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import SIDES
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import Case, load_case
-from tkamb.knee.contact_points import CondylePoint
 from tkamb.knee.equations import KneeGeometry
 from tkamb.knee.frame import FrameStart
 from tkamb.knee.patella import touching_patella
+from tkamb.knee.unknowns import CondylePoint
 from tkamb.run.identity import RUN_AGAIN, case_of_results, same_files, scene_hash
 from tkamb.run.metrics import map_rows
 from tkamb.run.read_scene import recording_of
@@ -31,9 +31,7 @@ class CaseResults:
     """A case and the results that belong to it.
 
     Args:
-        case: content of the scene and its files.
         recording: knee and motion of the case, which give the geometry of the drawing.
-        results: results of the case.
         frames: index of the motion's frame for each row of the results.
     """
 
@@ -91,7 +89,6 @@ class Source:
 
     Args:
         path: folder that `tkamb run` wrote, or scene file.
-        case: content of the scene and its files.
         results: results of the case; None: it has not been run.
         kept: folder with the results of a scene file; None: no such folder, or `path` is a folder.
     """
@@ -178,7 +175,6 @@ def check_frame(sources: Sequence[Source], frame: int) -> None:
     """Raise an InputError if no run has the frame. Call it before any run or drawing.
 
     Args:
-        sources: sources of the runs.
         frame: row of the results; negative ones count from the end.
 
     Raises:

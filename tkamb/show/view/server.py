@@ -31,16 +31,16 @@ from tkamb.units import MEGAPASCAL, MILLIMETRE
 HOST = "127.0.0.1"
 
 
-# Largest number of bytes of a request; a longer request is refused. Chosen because the page's
+# Largest number of bytes of a request; a longer request is refused. The page's
 # requests are far shorter.
 MOST_REQUEST_BYTES = 10_000
-# s: a connection is closed if its client sends no byte for this time. Chosen because a browser
+# s: a connection is closed if its client sends no byte for this time. A browser
 # sends its request at once.
 IDLE_SECONDS = 15.0
-# Largest number of characters of a text answer; the rest is cut off. Chosen because a page can
+# Largest number of characters of a text answer; the rest is cut off. A page can
 # show this many.
 LONGEST_LINE = 2000
-# Number of random bytes of the token in the address. Chosen because nobody can guess it.
+# Number of random bytes of the token in the address. Nobody can guess it.
 TOKEN_BYTES = 18
 
 
@@ -82,10 +82,6 @@ class ContactSwitch:
 
     def answer(self, row: int, model: str) -> bytes:
         """Return the pressure map and its legend for one frame, compressed.
-
-        Args:
-            row: row of the results.
-            model: name of the contact model.
 
         Raises:
             TkambError: the model or frame does not exist, the model cannot be prepared, or a newer
@@ -337,7 +333,6 @@ class _Handler(BaseHTTPRequestHandler):
         )
 
     def _send_line(self, status: HTTPStatus, words: str) -> None:
-        """Send one line of text."""
         line = " ".join(words.split())[:LONGEST_LINE]
         # a name in the request may contain characters that UTF-8 cannot encode
         self._send(status, "text/plain; charset=utf-8", line.encode(errors="backslashreplace"))

@@ -58,7 +58,7 @@ sole, to the right) and a radius."""
 
 # mm: radius of the ball at the ankle. Chosen by eye.
 ANKLE_RADIUS_MM = 20.0
-# m: distance from the ankle to the floor's centre in front of it. Chosen because it is about the
+# m: distance from the ankle to the floor's centre in front of it. It is about the
 # middle of a foot.
 PLATE_CENTRE = 60.0 * MILLIMETRE
 
@@ -81,7 +81,6 @@ def solids(
     pose of `states`.
 
     Args:
-        case: case of the run.
         recorded: recorded pose_femur_in_insert, shape (f, 4, 4).
         states: state of the chain in each frame.
         maps: pressure maps of the run, each with the pose of the femoral component.
@@ -198,7 +197,6 @@ def floor_and_foot(
     """Return floor, foot and centre of pressure; empty without a force plate.
 
     Args:
-        case: case of the run.
         geometries: geometry of each frame.
         frames: index of each frame in the motion.
     """
@@ -213,7 +211,8 @@ def floor_and_foot(
     lowest = float((tibias[:, 1, 3] - floor).min())
     feet = grounds.copy()
     feet[:, :3, 3] += (tibias[:, 1, 3] - floor - lowest)[:, None] * grounds[:, :3, 1]
-    plate = Solid("floor", "floor", _floor_surface(), FLOOR, 0.6, grounds)
+    slab = box(PLATE, "floor").moved(pose(np.eye(3), [PLATE_CENTRE, -0.5 * PLATE[1], 0.0]))
+    plate = Solid("floor", "floor", slab, FLOOR, 0.6, grounds)
     foot = Solid("foot", "bones", _foot_surface(lowest), BONE, 1.0, feet)
     points = np.stack([centre_of_pressure(one) for one in geometries])
     marker = Marker("centre of pressure", "floor", BLACK, points, 5.0 * MILLIMETRE)
@@ -230,10 +229,6 @@ def _floor_pose(geometry: KneeGeometry, tibia_in_laboratory: Array, floor: float
     below[1] = floor
     axes = np.column_stack([ahead, up, np.cross(ahead, up)])
     return pose(axes, transform(laboratory, below))
-
-
-def _floor_surface() -> Surface:
-    return box(PLATE, "floor").moved(pose(np.eye(3), [PLATE_CENTRE, -0.5 * PLATE[1], 0.0]))
 
 
 def _foot_surface(height: float) -> Surface:

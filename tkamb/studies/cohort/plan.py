@@ -163,7 +163,6 @@ class CohortRun:
         number: number of the run in the table of runs, from 0.
         labels: "subject", "trial", "activity", "design", "contact" -> name; "" for an axis without
             entries.
-        scene_path: path of the scene file.
         overrides: dotted key of the scene -> value.
         scene: scene with the overrides applied.
     """
@@ -189,7 +188,6 @@ class Cohort:
     """A cohort file and the runs that it defines.
 
     Args:
-        path: path of the file.
         table: validated content of the file.
         runs: all runs, sorted by subject, trial, design and contact in the order of the file.
     """

@@ -217,7 +217,6 @@ def run_cohort(
     reason and does not stop the cohort.
 
     Args:
-        cohort: the cohort, or the path of its file.
         directory: folder of the results. A part is stored in a folder inside it, without table
             and report.
         crew: worker pool settings; default: this process.

@@ -26,7 +26,7 @@ AXES = ("flexion_deg", CYCLE)
 
 
 # Distance from the upper edge of a bin, relative to its width, within which a value belongs to the
-# next bin. Chosen above round-off: 60 deg converted from radians is 59.99999999999999.
+# next bin. Above round-off: 60 deg converted from radians is 59.99999999999999.
 BIN_TOLERANCE = 1e-9
 
 
@@ -37,7 +37,6 @@ class Group:
     Args:
         labels: axis of the cohort -> label that the runs share.
         numbers: numbers of the r runs with results.
-        failed: number of failed runs.
         axis: column that is divided into bins, "flexion_deg" or "cycle_percent".
         edges: edges of the b bins, in the unit of the axis, shape (b + 1,).
         bins: column -> mean of each run in each bin, shape (r, b); NaN for a bin without frames.

@@ -25,10 +25,10 @@ PHI_REACH, Z_REACH = np.radians(30.0), 9.0
 """rad, mm: half the size of the search area."""
 
 
-# Number of times that the search area around the lowest point of a condyle is halved. Chosen
-# because 18 leave 4e-6 of the area's size.
+# Number of times that the search area around the lowest point of a condyle is halved.
+# 18 leave 4e-6 of the area's size.
 HALVINGS = 18
-# rad: largest difference of the adduction from the initial guess. Chosen because both condyles
+# rad: largest difference of the adduction from the initial guess. Both condyles
 # touch within it.
 LARGEST_ADDUCTION = 0.04
 
@@ -113,7 +113,6 @@ class Design:
     """One implant.
 
     Args:
-        name: name of the folder.
         title: description of the modelled implant.
         bearing: "fixed" or "mobile".
         symmetric: whether both condyles have the same J-curve.

@@ -24,7 +24,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.studies.designs import solids
 
-# Number of facets around a cam. Chosen because the facets lie within 0.05 % of the radius.
+# Number of facets around a cam. The facets lie within 0.05 % of the radius.
 SIDES = 96
 # Number of rings of vertices along the cam. Chosen for triangles about as long as wide.
 STATIONS = 13
@@ -32,7 +32,7 @@ STATIONS = 13
 FLANGE_MM = 1.0
 # deg: half the angle that the cam's opening in a wall subtends at the origin.
 WINDOW_DEG = 22.0
-# mm: distance within which a vertex lies in the plane of a wall. Chosen above round-off.
+# mm: distance within which a vertex lies in the plane of a wall. Above round-off.
 WALL_TOLERANCE_MM = 1e-6
 
 
@@ -66,7 +66,6 @@ def joined(cam: Cam, box_half: float, vertices: Array, faces: Ids) -> tuple[Arra
     """Return the closed triangulation of a femoral component with its cam.
 
     Args:
-        cam: the cam.
         box_half: half the width of the box, mm. Its walls are the planes z = ±box_half.
         vertices: vertices of the component without the cam, mm, shape (n, 3).
         faces: faces of the component without the cam, shape (k, 3).
@@ -240,7 +239,6 @@ class FemoralComponent:
         notch_half: half the width of the notch.
         notch_fillet: radius of the rounded edge of the notch.
         thickness: thickness of the component.
-        thickness_at_flange_top: thickness at the top of the flange.
         blend_half: ML distance from the middle within which unequal J-curves blend.
         cam: cam of a posterior-stabilised component; None: no cam.
     """

@@ -13,7 +13,7 @@ from tkamb.geometry.frames import Array
 from tkamb.studies.designs import solids
 from tkamb.studies.designs.femoral import rounded_edge
 
-# mm: distance from the middle within which unequal dishes blend. Chosen because contacts lie
+# mm: distance from the middle within which unequal dishes blend. Contacts lie
 # outside it.
 BLEND_HALF_WIDTH = 8.0
 

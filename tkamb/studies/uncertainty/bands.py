@@ -179,7 +179,6 @@ def discrepancy_columns(
     Args:
         names: names of m columns of results.csv.
         values: values of the samples, shape (n, m, f).
-        summary: summary of the run.
         body_weight: body weight, N.
     """
     discrepancy = discrepancy_of(summary)

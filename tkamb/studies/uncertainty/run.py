@@ -186,7 +186,6 @@ def estimate_uncertainty(
     samples of a smaller one.
 
     Args:
-        scene: scene, or the path of its file.
         samples: number of samples, at least 20.
         workers: number of processes; 1: compute in this process.
         dask: address of a Dask scheduler, or "local" for worker processes on this computer,
@@ -284,7 +283,6 @@ class _Job:
         )
 
     def run(self, shards: Shards | None) -> Uncertainty:
-        """Compute the samples that are not stored yet and return the result of all samples."""
         names = banded_names(self.nominal)
         count = len(self.points)
         samples = _stored(shards, count)

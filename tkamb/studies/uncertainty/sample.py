@@ -296,7 +296,6 @@ class Sampler:
     """Computes samples of one scene.
 
     Args:
-        scene: the scene.
         frames: numbers of the frames to compute.
         names: requested columns of results.csv.
 
@@ -386,7 +385,6 @@ class BandWorker:
     """Computes samples in a worker. It can be prepared before the column names are known.
 
     Args:
-        scene: the scene.
         frames: numbers of the frames to compute.
     """
 

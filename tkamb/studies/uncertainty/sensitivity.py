@@ -94,7 +94,6 @@ def sobol_indices(
 def _index(
     result: str, name: str, a: Array, b: Array, crossed: Array, weights: Array
 ) -> SobolIndex | None:
-    """Return the indices of one input from values (n, f); None: too few rows, or no variance."""
     finite = np.isfinite(a) & np.isfinite(b) & np.isfinite(crossed)
     enough = finite.sum(axis=0) >= MIN_SAMPLES
     if not enough.any():
@@ -170,7 +169,6 @@ def screen(
     Interactions of inputs are not included; `estimate_uncertainty` includes them.
 
     Args:
-        scene: the scene.
         frames: slice of the frames; default: all.
         crew: worker pool settings; default: this process.
         progress: wrapper of the iterator of the finished samples.

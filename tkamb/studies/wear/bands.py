@@ -152,10 +152,10 @@ class WearBandSettings:
     """Bands of wear from samples."""
 
     samples: int = 32
-    """Default number of samples. Chosen because the 5th and 95th percentiles then lie between the
+    """Default number of samples. The 5th and 95th percentiles then lie between the
     smallest and the largest sample."""
     max_samples: int = 10_000
-    """Largest number of samples that is accepted. Chosen because more take too long."""
+    """Largest number of samples that is accepted. More take too long."""
 
 
 WEAR_BAND = WearBandSettings()
@@ -181,7 +181,6 @@ class WearBands:
 
     Args:
         varied: varied inputs.
-        samples: number of samples.
         failed: number of samples without contact. The bands exclude them.
         ended: number of samples that ended before the last cycle. Later bands exclude them.
         rows: for each row of the table "<column>_p05", "_p50" and "_p95" -> percentile; NaN with
@@ -239,7 +238,6 @@ class Sampling:
         inputs: the d varied inputs.
         root: Cholesky factor of the correlation matrix, shape (d, d), see
             `tkamb.studies.uncertainty.sampling`.
-        samples: number of samples.
         seed: seed of the random numbers.
         constant_share: share of the variance of a pose error that is constant over the frames.
     """

@@ -29,7 +29,7 @@ class WearGridSettings:
     """Grid of the initial guesses of the dwell position."""
 
     spacing_z: float = 0.002
-    """m: spacing of the initial guesses along z (mediolateral). Chosen because a wear scar is
+    """m: spacing of the initial guesses along z (mediolateral). A wear scar is
     several times as wide."""
 
 

@@ -32,7 +32,7 @@ class WearLawSettings:
     """Accepted parameters of wear laws."""
 
     max_wear_factor: float = 1e-3
-    """mm³/(N m): largest accepted wear factor. Chosen as a hundred times the largest value measured
+    """mm³/(N m): largest accepted wear factor. A hundred times the largest value measured
     for polyethylene in a joint."""
 
 

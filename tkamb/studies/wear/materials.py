@@ -87,8 +87,6 @@ class WearMaterial:
     """A wear material with the sources of its numbers.
 
     Args:
-        name: name in messages.
-        text: description.
         density_kg_per_m3: density, kg/m³.
         law: name of the default law.
         laws: name of a law -> its parameters.

@@ -23,11 +23,11 @@ class CycleMotionSettings:
     """Closing of a recorded motion to a cycle."""
 
     lever_arm: float = 0.025
-    """m: displacement per rotation in rad, to add rotations to translations. Chosen as half the
+    """m: displacement per rotation in rad, to add rotations to translations. Half the
     distance between the condyles."""
     notable_gap: float = 0.1
     """Distance between the ends of the motion, relative to its extent, above which the report adds
-    a question. Chosen because the ends of recorded cycles are closer."""
+    a question. The ends of recorded cycles are closer."""
 
 
 CYCLE_MOTION = CycleMotionSettings()

@@ -42,10 +42,10 @@ PROPORTIONAL = ("volume_mm3", "mass_mg", "max_depth_mm")
 
 
 # Relative change of the volume of a cycle with half as many frames. Above it the report asks for
-# more frames. Chosen below the error of a wear law.
+# more frames. Below the error of a wear law.
 MAX_FRAME_CHANGE = 0.02
 # Relative correction of the force of a map. Above it the report asks for a finer resolution.
-# Chosen below the error of a wear law.
+# Below the error of a wear law.
 MAX_MAP_CORRECTION = 0.05
 # Ratio to the published wear rates. The report asks about rates above the highest published rate
 # times the ratio, or below the lowest over the ratio.
@@ -365,7 +365,6 @@ def draw_wear(
     Args:
         surface: insert in the insert frame.
         maps: name -> values at the vertices.
-        rows: rows of the table.
         path: PNG file to write.
         side: "right" or "left" knee.
     """

@@ -102,9 +102,7 @@ class WearRun:
 
     Args:
         setup: bodies, motion and contact.
-        case: bodies, motion and laws.
         material: wear material.
-        cycles: number of cycles.
         updates: number of updates of the geometry.
         sampling: samples for bands; None: no bands.
     """
@@ -236,7 +234,6 @@ def prepare_wear(
 
     Args:
         path: scene file, or folder that `tkamb run` wrote.
-        cycles: number of cycles.
         updates: number of updates of the insert's geometry.
         law: name of a wear law (`tkamb.studies.wear.laws`); None: that of [wear] in the scene, or
             the default law of the material.
@@ -276,9 +273,7 @@ def wear_of_results(
 
     Args:
         scene: scene of the results, with their contact model.
-        path: path of the scene file.
         results: results with pressure maps.
-        cycles: number of cycles.
         updates: number of updates of the insert's geometry.
         frames: largest number of frames of a cycle.
 

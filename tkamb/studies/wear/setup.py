@@ -44,7 +44,6 @@ class WearSetup:
         articular: articular surface of the insert.
         motion: motion of one cycle.
         side: side of the knee. The bodies of a left knee are mirrored.
-        contact: name of the contact model.
         resolution_mm: spacing of the model's map points, mm.
         source: file or folder of the motion.
         scene_sha256: SHA-256 of the scene, without and with the requested contact model. The
@@ -163,7 +162,6 @@ def setup_of_results(scene: Scene, path: Path, results: Results, frames: int) ->
 
     Args:
         scene: scene of the results, with their contact model.
-        path: path of the scene file.
         results: results with pressure maps.
         frames: largest number of frames of a cycle.
 

@@ -24,22 +24,22 @@ class WearSimulationSettings:
     """Simulation of wear over many cycles."""
 
     max_cycles: float = 10**9
-    """Largest number of cycles that is accepted. Chosen as a thousand years of walking."""
+    """Largest number of cycles that is accepted. A thousand years of walking."""
     max_updates: int = 10_000
     """Largest number of updates of the geometry that is accepted. Chosen to limit the size of the
     results."""
     min_thickness: float = 1e-4
-    """m: thickness at which the insert counts as worn through. Chosen because no contact model is
+    """m: thickness at which the insert counts as worn through. No contact model is
     valid for a thinner layer."""
     min_depth: float = 1e-9
-    """m: depth below which a point counts as unworn. Chosen above the round-off of a mesh."""
+    """m: depth below which a point counts as unworn. Above the round-off of a mesh."""
     max_pattern_change: float = 0.2
     """Share of the wear rate that moves to other points, above which a block is halved. Larger:
-    fewer blocks, less accurate. Chosen below the error of a wear law."""
+    fewer blocks, less accurate. Below the error of a wear law."""
     max_block_division: int = 256
     """Largest ratio of the longest block to a halved block. Chosen to allow eight halvings."""
     min_row_share: float = 0.5
-    """Share of the rows of a force-controlled profile that must converge. Chosen because fewer rows
+    """Share of the rows of a force-controlled profile that must converge. Fewer rows
     do not describe the cycle."""
     min_improvement: float = 1.1
     """Factor by which a halving must reduce the share that moves to other points. Otherwise the
@@ -183,7 +183,6 @@ def simulate_wear(
     contact is lost. `end` then contains the reason.
 
     Args:
-        case: bodies, motion and laws.
         cycles: number of cycles, at least 1.
         updates: smallest number of blocks.
         state: state of an earlier simulation of the case, to resume it; None: unworn.
@@ -277,7 +276,6 @@ def first_cycle(case: WearCase, laws: Mapping[str, WearLaw]) -> FirstCycle:
     """Return the effect of the number of frames, and the worn volumes of several laws.
 
     Args:
-        case: bodies, motion and laws.
         laws: name -> wear law.
     """
     recorded = bool(case.motion.closing)

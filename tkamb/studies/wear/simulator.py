@@ -63,7 +63,6 @@ class Springs:
 
     Args:
         springs: coordinate, "ap" or "axial_rotation" -> spring.
-        sources: sources of the numbers.
         table: coordinate -> key of the file -> value in the units of the file.
     """
 
@@ -225,7 +224,6 @@ class EquilibriumPoses:
     The initial guess of a row is the last equilibrium.
 
     Args:
-        model: contact model.
         state: prepared contact of the model with the insert.
         drive: loads of the machine.
     """
@@ -296,12 +294,12 @@ class WearProfileSettings:
     """Checks of the profile of a simulator."""
 
     max_force: float = 1e4
-    """N: largest axial force. Chosen as fifteen body weights."""
+    """N: largest axial force. Fifteen body weights."""
     step_tolerance: float = 1e-9
-    """Share by which a step may exceed the largest step. Chosen above round-off."""
+    """Share by which a step may exceed the largest step. Above round-off."""
     closure_tolerance: float = 0.01
-    """Largest difference between first and last row of a column, relative to its range. Chosen
-    above the noise of a profile."""
+    """Largest difference between first and last row of a column, relative to its range. Above
+    the noise of a profile."""
 
 
 WEAR_PROFILE = WearProfileSettings()
@@ -320,7 +318,6 @@ class Profile:
             (f, 6).
         free: indices of the coordinates with a force or torque in the file; empty with
             displacement control.
-        source: path of the file.
     """
 
     percent: Array
@@ -378,7 +375,6 @@ def read_profile(path: str | Path, frames: int) -> Profile:
     component on the insert, with tkamb's signs.
 
     Args:
-        path: path of the file.
         frames: smallest number of frames of a cycle, at least 2.
 
     Raises:

@@ -22,13 +22,13 @@ class WornSurfaceSettings:
     """Surface from which wear is removed."""
 
     min_normal_y: float = 0.1
-    """Smallest y component of the unit normal of a face that can wear. Chosen because such a face
+    """Smallest y component of the unit normal of a face that can wear. Such a face
     is inclined by 84 deg."""
     ray_offset: float = 1e-6
-    """m: depth below the surface at which rays through the insert begin. Chosen above the round-off
+    """m: depth below the surface at which rays through the insert begin. Above the round-off
     of a mesh."""
     max_halvings: int = 12
-    """Largest number of halvings of an edge. Chosen because they reduce one metre to a quarter of a
+    """Largest number of halvings of an edge. They reduce one metre to a quarter of a
     millimetre."""
 
 

@@ -48,13 +48,13 @@ class FactorCacheSettings:
     """The folder of factorised lattices on disk."""
 
     least_unknowns: int = 20_000
-    """Unknowns: smaller operators are not stored. Chosen because factorising them takes two seconds
+    """Unknowns: smaller operators are not stored. Factorising them takes two seconds
     or less."""
     size_limit: float = 6e9
-    """Bytes: largest size of the folder. The least recently used files are removed first. Chosen
-    because it is a small part of a usual disk."""
+    """Bytes: largest size of the folder. The least recently used files are removed first.
+    It is a small part of a usual disk."""
     largest_error: float = 2e-3
-    """1: largest relative error of a stored operator (`operator_error`). Chosen because rounding to
+    """1: largest relative error of a stored operator (`operator_error`). Rounding to
     16 bits causes 5e-4 for every Poisson's ratio and bearing; four times as much means a damaged
     file."""
     orphan_seconds: float = 600.0

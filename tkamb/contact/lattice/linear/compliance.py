@@ -34,10 +34,10 @@ class ResponseSettings:
     """Products of columns of Z, for the compliance."""
 
     gathered_columns: int = 512
-    """Columns that are copied for BLAS at a time. Chosen because their 3 MB fit into a processor's
+    """Columns that are copied for BLAS at a time. Their 3 MB fit into a processor's
     cache."""
     few_columns: int = 12
-    """Largest number of columns that are multiplied without BLAS. Chosen because the copy for BLAS
+    """Largest number of columns that are multiplied without BLAS. The copy for BLAS
     costs more time than it saves for so few columns."""
 
 
@@ -356,7 +356,7 @@ class ComplianceSettings:
     """The stored compliance of candidate nodes."""
 
     max_nodes: int = 1500
-    """Largest number of nodes of the stored compliance. Chosen because the matrix then takes 80
+    """Largest number of nodes of the stored compliance. The matrix then takes 80
     MB."""
     spare_nodes: int = 100
     """Number of nodes that may be added before the arrays have to grow. Larger: more memory, fewer

@@ -46,13 +46,13 @@ class MemoryNeedSettings:
     order, 16 for the arrays of the compliance. Measured: without these 16 the estimate is 12 %
     low."""
     safety_factor: float = 1.1
-    """1: factor on the estimate. Chosen because the proposed cell size must fit."""
+    """1: factor on the estimate. The proposed cell size must fit."""
     memory_exponent: float = 3.0
     """1: the memory is proportional to at least this power of 1 / cell size. Measured: 3.7."""
     cell_size_step: float = 0.05e-3
-    """m: proposed cell sizes are multiples of it. Chosen because it gives round numbers."""
+    """m: proposed cell sizes are multiples of it. It gives round numbers."""
     largest_cell_size: float = 5e-3
-    """m: largest cell size that is proposed. Chosen because a condyle's contact is then two cells
+    """m: largest cell size that is proposed. A condyle's contact is then two cells
     wide."""
 
 

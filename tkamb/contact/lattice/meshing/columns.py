@@ -27,13 +27,13 @@ from tkamb.geometry.height_field import Intervals, inside_intervals
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 
-# 1: longest over shortest edge of a cell before its nodes are moved onto the surface. Chosen
-# because flatter hexahedra are too stiff in bending.
+# 1: longest over shortest edge of a cell before its nodes are moved onto the surface.
+# Flatter hexahedra are too stiff in bending.
 MAX_EDGE_RATIO = 1.4
-# 1: steepest slope, rise over run, that the layers follow (45 deg). Chosen because steeper layers
+# 1: steepest slope, rise over run, that the layers follow (45 deg). Steeper layers
 # would shear the cells.
 MAX_SLOPE = 1.0
-# 1: largest share of columns that are too low for the layers. Chosen because a few columns at the
+# 1: largest share of columns that are too low for the layers. A few columns at the
 # rim may be too low.
 MAX_LOW_SHARE = 0.01
 
@@ -171,18 +171,18 @@ def _filled(height: Array) -> Array:
 Nodes = tuple[Index, ...]
 
 
-# Cells: distances this near to half a cell count as half a cell. Chosen above rounding errors.
+# Cells: distances this near to half a cell count as half a cell. Above rounding errors.
 COLUMN_TIE = 1e-6
-# Cells: vertices this near to the bounding box lie on its side. Chosen above the noise of meshes.
+# Cells: vertices this near to the bounding box lie on its side. Above the noise of meshes.
 SIDE_TOLERANCE = 0.02
-# 1: a triangle with a smaller y of its normal (87 deg) belongs to a wall. Chosen because no
+# 1: a triangle with a smaller y of its normal (87 deg) belongs to a wall. No
 # articular surface is that steep.
 WALL_NORMAL_Y = 0.05
-# Cells: distance inside a wall at which a missed vertical ray is repeated. Chosen because a ray
+# Cells: distance inside a wall at which a missed vertical ray is repeated. A ray
 # exactly on a rough wall may miss the part.
 WALL_INSET = 0.02
 # Cells: largest change of a surface's height when a node moves sideways. If it is larger, the ray
-# has hit another surface. Chosen because slopes that cells follow cause smaller changes.
+# has hit another surface. Slopes that cells follow cause smaller changes.
 MAX_HEIGHT_CHANGE = 0.75
 
 

@@ -12,10 +12,10 @@ from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 
-# m: height above a node at which the ray to its triangle begins. Chosen above the rounding of a
+# m: height above a node at which the ray to its triangle begins. Above the rounding of a
 # mesh and below the next surface.
 RAY_START_HEIGHT = 1e-4
-# m: a node this near to a triangle lies on it. Chosen because coordinates in single precision are
+# m: a node this near to a triangle lies on it. Coordinates in single precision are
 # rounded by some 1e-9 m.
 ON_MESH_DISTANCE = 1e-6
 

@@ -34,9 +34,9 @@ from tkamb.geometry.surface import Surface
 from tkamb.units import MILLIMETRE
 
 # 1: smallest number of cells of a piece, relative to the largest piece. Smaller pieces are
-# omitted. Chosen because they are fragments of the rim.
+# omitted. They are fragments of the rim.
 LEAST_PIECE_SHARE = 0.01
-# m: distance of the lines that measure the volume of overlapping bodies. Chosen because the error
+# m: distance of the lines that measure the volume of overlapping bodies. The error
 # of the volume is then below 0.1 %.
 LINE_SPACING = 2.5e-4
 
@@ -176,19 +176,19 @@ INTERNAL, CONTACT, BOTTOM, OTHER = 0, 1, 2, 3
 """Node classes: inside, top surface, flat bottom, other surfaces (walls, underside)."""
 
 
-# 1: longest over shortest edge of a grid cell. Chosen because flatter hexahedra are too stiff in
+# 1: longest over shortest edge of a grid cell. Flatter hexahedra are too stiff in
 # bending.
 MAX_EDGE_RATIO = 1.4
-# m: nodes this near to the plane of the flat bottom lie in it. Chosen because flat bottoms of
+# m: nodes this near to the plane of the flat bottom lie in it. Flat bottoms of
 # meshes vary by as much.
 BOTTOM_TOLERANCE = 5e-5
-# Largest number of cells of a grid over the bounding box. Chosen because a knee has as many at
+# Largest number of cells of a grid over the bounding box. A knee has as many at
 # 0.35 mm, which take more than 50 GB.
 MAX_CELLS = 1_000_000
-# 1: a cell with a smaller scaled Jacobian is omitted. Chosen because its stiffness would be ill-
+# 1: a cell with a smaller scaled Jacobian is omitted. Its stiffness would be ill-
 # conditioned.
 LEAST_JACOBIAN = 0.05
-# 1: a cell with a shorter edge, relative to the smallest spacing, is omitted. Chosen because its
+# 1: a cell with a shorter edge, relative to the smallest spacing, is omitted. Its
 # stiffness would be ill-conditioned.
 LEAST_EDGE = 0.2
 

@@ -28,13 +28,13 @@ from tkamb.units import DEGREE, MILLIMETRE
 _log = logging.getLogger("tkamb")
 
 
-# 1: largest difference. Chosen because stiffness and pressure of an insert of 8 mm change by about
+# 1: largest difference. Stiffness and pressure of an insert of 8 mm change by about
 # as much.
 TOLERANCE = 0.02
-# 1: cell sizes that are tried in turn, relative to the desired size. Chosen because the last one
+# 1: cell sizes that are tried in turn, relative to the desired size. The last one
 # gives twice as many cells.
 SIZES = (1.0, 0.95, 0.9, 0.85, 0.8)
-# 1: after a larger difference no smaller cells are tried. Chosen because a whole part is then
+# 1: after a larger difference no smaller cells are tried. A whole part is then
 # missing, not a thin rim.
 BEYOND_REFINEMENT = 0.1
 
@@ -102,9 +102,6 @@ class LatticeQuality:
     """Measures of a lattice.
 
     Args:
-        nodes: number of nodes.
-        cells: number of cells.
-        springs: number of springs.
         volume: volume of all cells, m³.
         mesh_volume: volume that the mesh encloses, m³.
         edge_ratio: longest over shortest edge of a cell: median, 95th percentile, largest.

@@ -26,15 +26,15 @@ from tkamb.geometry.rays import RayCaster
 from tkamb.geometry.surface import Surface
 
 # 1: a node is moved towards the line between its neighbours, except for this share of the way.
-# Chosen because on the line the cell's corner would be flat.
+# On the line the cell's corner would be flat.
 CORNER_MARGIN = 0.1
 # 1: a node is moved to the corner of the part, and from there inwards by this share of the way to
-# the node across the diagonal. Chosen because vertical rays then meet the part.
+# the node across the diagonal. Vertical rays then meet the part.
 CORNER_INSET = 1e-3
 # Cells: distance below the top, or above the bottom, of points that are tested for being inside
-# the part. Chosen above the rounding of a mesh and within the cell.
+# the part. Above the rounding of a mesh and within the cell.
 RAY_START_CELLS = 0.1
-# Diagonals of a cell's face: largest move of a node. Chosen because a larger move would invert the
+# Diagonals of a cell's face: largest move of a node. A larger move would invert the
 # cell.
 MAX_MOVE_DIAGONALS = 0.75
 
@@ -146,10 +146,10 @@ STEPS = ((0, 1), (0, -1), (2, 1), (2, -1))
 """Axis and sign of the four sideways directions."""
 
 
-# 1: distance inside the wall of a node that is moved to it, relative to the move. Chosen because
-# vertical rays then meet the part.
+# 1: distance inside the wall of a node that is moved to it, relative to the move.
+# Vertical rays then meet the part.
 WALL_INSET = 1e-6
-# Cells: distance inside the surface at which sideways rays of end nodes begin. Chosen above the
+# Cells: distance inside the surface at which sideways rays of end nodes begin. Above the
 # rounding of a mesh and within the cell.
 WALL_NODE_RAY_START_CELLS = 0.1
 
