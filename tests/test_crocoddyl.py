@@ -3,6 +3,9 @@
 `scripts/check_control` runs this file in an environment whose Crocoddyl and Pinocchio fit.
 """
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -177,3 +180,35 @@ def test_the_implicit_step_agrees_with_central_differences(action, control):
         for move in np.diag([1e-3, 1e-3, 1e-3, 1e-3, 1e-2])
     ]
     assert column_errors(data.Fu, np.array(ends).T).max() < 1e-3
+
+
+def test_external_forces_act_and_a_state_without_numbers_has_no_force(action, control):
+    model, x, u = action
+    knee, pushed = model.knee, pin.StdVec_Force([pin.Force.Zero()] * model.knee.model.njoints)
+    pushed[1] = pin.Force(np.array([0.0, 50.0, 0.0, 0.0, 0.0, 4.0]))
+    other = control.KneeDynamics(
+        model.state, model.actuation, knee, model.costs, model.muscles, model.tensions, pushed
+    )
+    data = other.createData()
+    other.calc(data, x, u)
+    other.actuation.calc(data.actuation, x, u[: other.actuation.nu])
+    q, v = x[: model.state.nq], x[model.state.nq :]
+    tensions = other._tensions(u)
+    expected = knee.forward_dynamics(q, v, data.actuation.tau, pushed, tensions)
+    assert np.array(data.xout) == pytest.approx(expected, rel=1e-9, abs=1e-9)
+    free = knee.forward_dynamics(q, v, data.actuation.tau, None, tensions)
+    assert np.abs(expected - free).max() > 0.1
+    residual = control.CondyleForces(model.state, knee, model.nu)
+    found = residual.createData(data.collector)
+    residual.calc(found, np.full(len(x), np.nan), u)
+    assert np.isnan(found.r).all()
+
+
+def test_the_example_of_the_page_converges(action):
+    page = (Path(tkamb.__file__).parents[1] / "docs" / "plug_in.md").read_text(encoding="utf-8")
+    (block,) = [b for b in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "FDDP" in b]
+    model, x, _ = action
+    names = {"knee": model.knee, "model": model.knee.model, "x0": np.array(x)}
+    names["x0"][model.state.nq :] = 0.0
+    exec(block, names)
+    assert names["solver"].stop < 1e-6

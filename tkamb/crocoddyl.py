@@ -2,7 +2,8 @@
 
 `KneeDynamics` is a differential action model: its acceleration is `Knee.forward_dynamics`, and its
 derivatives are exact. Contact on polyethylene is stiff: an explicit integrator needs steps below a
-millisecond. `KneeStep` integrates it by implicit Euler, so that steps of 10 to 50 ms are stable:
+millisecond. `KneeStep` integrates it by implicit Euler, so that steps of 10 to 50 ms are
+stable near equilibrium:
 
     v' = v + h a(q', v', u),    q' = integrate(q, h v').
 
@@ -21,6 +22,7 @@ optimal control, ICRA (2020), doi:10.1109/ICRA40945.2020.9196673.
 """
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -54,6 +56,8 @@ class KneeDynamics(crocoddyl.DifferentialActionModelAbstract):
         costs: `crocoddyl.CostModelSum`; its nu is the number of all controls.
         muscles: names of muscles whose tensions are controls.
         tensions: muscle -> constant tension, N.
+        fext: constant external forces, one `pin.Force` per joint in the joint's frame, as those of
+            `pin.aba`; None: zero.
 
     Raises:
         InputError: the state is that of another model, or the costs have another number of
@@ -68,6 +72,7 @@ class KneeDynamics(crocoddyl.DifferentialActionModelAbstract):
         costs: Any,
         muscles: Sequence[str] = (),
         tensions: Mapping[str, float] | None = None,
+        fext: Any = None,
     ) -> None:
         count = actuation.nu + len(muscles)
         if state.nv != knee.model.nv or state.pinocchio != knee.model:
@@ -79,7 +84,7 @@ class KneeDynamics(crocoddyl.DifferentialActionModelAbstract):
         super().__init__(state, count, costs.nr)
         knee._tensions(dict.fromkeys(muscles, 0.0) | dict(tensions or {}))
         self.knee, self.actuation, self.costs = knee, actuation, costs
-        self.muscles, self.tensions = tuple(muscles), dict(tensions or {})
+        self.muscles, self.tensions, self.fext = tuple(muscles), dict(tensions or {}), fext
 
     def createData(self) -> "KneeDynamicsData":
         """Return new data."""
@@ -106,7 +111,7 @@ class KneeDynamics(crocoddyl.DifferentialActionModelAbstract):
             return np.full(self.state.nv, np.nan)
         try:
             return self.knee.forward_dynamics(
-                q, v, data.actuation.tau, tensions=tensions, data=data.knee
+                q, v, data.actuation.tau, self.fext, tensions, data.knee
             )
         except ComputationError:
             return np.full(self.state.nv, np.nan)
@@ -120,7 +125,7 @@ class KneeDynamics(crocoddyl.DifferentialActionModelAbstract):
         self.actuation.calcDiff(data.actuation, x, u[:count])
         tensions = self._tensions(u)
         by_q, by_v, by_tau = self.knee.forward_dynamics_derivatives(
-            q, v, data.actuation.tau, tensions=tensions, data=data.knee
+            q, v, data.actuation.tau, self.fext, tensions, data.knee
         )
         by_x = np.hstack([by_q, by_v]) + by_tau @ data.actuation.dtau_dx
         by_u = np.zeros((self.state.nv, self.nu))
@@ -321,7 +326,7 @@ class KneeStepData(crocoddyl.ActionDataAbstract):
 class _CondyleResidual(crocoddyl.ResidualModelAbstract):
     """Residual of one value per condyle, medial and lateral, that depends on q alone.
 
-    The values are NaN if the contact model is out of its range.
+    The values are NaN if the contact model is out of its range, and for a state that is not finite.
 
     Args:
         state: `crocoddyl.StateMultibody` of `knee.model`.
@@ -335,16 +340,16 @@ class _CondyleResidual(crocoddyl.ResidualModelAbstract):
         self._data = knee.create_data()
 
     def calc(self, data: Any, x: Array, u: Array | None = None) -> None:
-        try:
-            data.r = self._values(x[: self.state.nq])
-        except ComputationError:
-            data.r = np.full(2, np.nan)
+        data.r = np.full(2, np.nan)
+        if np.isfinite(x).all():  # not the state after a `KneeStep` that has not converged
+            with suppress(ComputationError):
+                data.r = self._values(x[: self.state.nq])
 
     def calcDiff(self, data: Any, x: Array, u: Array | None = None) -> None:
-        try:
-            by_q = self._slopes(x[: self.state.nq])
-        except ComputationError:
-            by_q = np.full((2, self.state.nv), np.nan)
+        by_q = np.full((2, self.state.nv), np.nan)
+        if np.isfinite(x).all():
+            with suppress(ComputationError):
+                by_q = self._slopes(x[: self.state.nq])
         data.Rx[:, :] = np.hstack([by_q, np.zeros((2, self.state.nv))])
 
     def _values(self, q: Array) -> Array:
