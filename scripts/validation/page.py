@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from validation import dissertation
+from validation import dissertation, patella
 from validation.design_tables import (
     CONDYLES,
     QUANTITIES,
@@ -81,6 +81,7 @@ def page(stored: dict[str, Any]) -> str:
     parts = [
         _head(stored),
         _values(stored["values"]),
+        patella.section(),
         _not_compared(),
         _findings(),
         _counts(stored["tables"]),
