@@ -8,6 +8,7 @@ steps that end before this jump agree with the derivative.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import cycle
 
 import numpy as np
 import pinocchio as pin
@@ -24,6 +25,8 @@ TOLERANCE = 1e-5
 """Relative error of a column, see `errors`."""
 SHORT, LONG = (1e-9, 1e-8), (1e-7, 1e-6)
 """m: steps of central differences with and without contact."""
+RATES = (1e-6, 1e-5)
+"""m/s: steps in v; the friction bends within 1 mm/s."""
 TENSIONS = {"hamstrings": 150.0}
 
 
@@ -57,7 +60,7 @@ def step_sizes(model, step):
     return sizes
 
 
-def slopes(values, knee, q, v, step, rate=1e-5):
+def slopes(values, knee, q, v, step, rate):
     """Return central differences of values by q and v, in the last axis."""
     model, found = knee.model, []
     for by_v, sizes in ((False, step_sizes(model, step)), (True, np.full(model.nv, rate))):
@@ -143,8 +146,8 @@ def agreement(values, computed, knee, q, v, steps=SHORT):
     differences differ by more than that, and one of them agrees.
     """
     found = [
-        [errors(*pair) for pair in zip(computed, slopes(values, knee, q, v, step), strict=True)]
-        for step in steps
+        [errors(*pair) for pair in zip(computed, slopes(values, knee, q, v, *sizes), strict=True)]
+        for sizes in zip(steps, cycle(RATES), strict=False)
     ]
     by_q, by_v = np.min(found, axis=0)
     size = np.abs(computed[0]).max(axis=tuple(range(computed[0].ndim - 1)))
@@ -175,7 +178,7 @@ def direction_agreement(values, computed, knee, q, v, steps=SHORT):
     for by_v in (False, True):
         found, scale = [], np.ones(model.nv) if by_v else step_sizes(model, 1.0)
         slope = computed[by_v] @ (scale * unit)
-        for step in (1e-5,) if by_v else steps:
+        for step in RATES if by_v else steps:
             move = step * scale * unit
             ends = [
                 values(q, v + s * move) if by_v else values(pin.integrate(model, q, s * move), v)
@@ -274,8 +277,9 @@ def lattice_case(read, name, newton):
     options = {"tolerance": 1e-9, "newton": newton, "cache": False}
     resolution = 3e-3 if newton else 2e-3
     knee = knee_of(read[0], name, resolution, options)
-    # The iteration stops before it follows a shorter step.
-    return Case(knee, lambda count: random_states(read, knee, count), steps=LONG)
+    # Without Newton's method the iteration stops before it follows a shorter step.
+    steps = (SHORT[1], *LONG) if newton else LONG
+    return Case(knee, lambda count: random_states(read, knee, count), steps=steps)
 
 
 def hamstrings(plain):
