@@ -28,19 +28,21 @@ tension: without them the ratio is close to the published one. At the end of the
 above the published range, as with the plane patella. The sign of tilt and shift depends on the
 assumed shares of the heads. Contact area rises with the force."""
 TIMED = """\
-`scripts/measure/patella` on {date}, code {code}: the shipped knee bend, femorotibial contact by the
-foundation at 1 mm, every second frame, one thread, load of the machine {load:.1f}: compare the
-ratios, not the times. All settings are solved in turn on every frame. Times are medians,
-"times plane" is the median of the ratios in a frame. Differences from the finest setting, the
-lattice at 1 mm: median (largest) of peak pressure, area and force of the button. The plane patella
-has no contact of the button here. "Frames" counts the frames with an equilibrium."""
+`scripts/measure/patella` on {date}, code {code}: the shipped knee bend, every second
+frame, femorotibial contact by the foundation at 1 mm, one thread, load of the machine
+{load:.1f}: compare the ratios, not the times. All settings are solved in turn on every frame.
+Times are medians; "times plane" is the median of the ratios in a frame. Changes of the
+button's peak pressure, area and force from the finest setting, the lattice at 1 mm: median
+(the one of largest size). The plane patella has no contact of the button here. "Frames"
+counts the frames with an equilibrium."""
 
 
 def differences(found: dict[str, dict[str, list[float]]]) -> list[dict[str, Any]]:
-    """Return median times, ratios to the first setting, and differences from the last setting.
+    """Return median times, ratios to the first setting, and changes from the last setting.
 
     A time ratio is the median over the frames, except the first, of the ratios of one frame. A
-    difference is the median and the largest over the frames in which both settings have a result.
+    change is the median and the one of largest size over the frames in which both settings have
+    a result.
 
     Args:
         found: for each setting the seconds, and the peak pressure, area and force of the button.
@@ -54,9 +56,10 @@ def differences(found: dict[str, dict[str, list[float]]]) -> list[dict[str, Any]
         row["ms"] = 1e3 * float(np.median(seconds))
         row["ratio"] = float(np.median(seconds / np.array(first["seconds"])[1:]))
         for key in ("peak", "area", "force"):
-            change = np.abs(np.array(found[name][key]) / np.array(finest[key]) - 1.0)
+            change = np.array(found[name][key]) / np.array(finest[key]) - 1.0
             kept = change[np.isfinite(change)]
-            row[key] = [float(np.median(kept)), float(kept.max())] if len(kept) else None
+            largest = kept[np.argmax(np.abs(kept))] if len(kept) else np.nan
+            row[key] = [float(np.median(kept)), float(largest)] if len(kept) else None
         row["frames"] = int(np.isfinite(found[name]["force"]).sum())
         rows.append(row)
     return rows
@@ -118,7 +121,9 @@ def tradeoff() -> list[str]:
     ]
     for row in found["settings"]:
         cells = [
-            f"{100 * row[key][0]:.3g} ({100 * row[key][1]:.3g})" if row[key] else ""
+            f"{100 * row[key][0]:+.2f} ({100 * row[key][1]:+.2f})"
+            if row[key] and row is not found["settings"][-1]
+            else ""
             for key in ("peak", "area", "force")
         ]
         lines.append(
