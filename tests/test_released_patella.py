@@ -7,16 +7,17 @@ import pytest
 
 import tkamb
 from mirrored_patient import write_mirrored_patient
-from released_patella import RELEASED
+from released_patella import RELEASED, bundle, head
 from scenes import as_toml, write_scene
 from tkamb.errors import InputError
 from tkamb.geometry.frames import PATELLA_BODY_COORDINATES
 
 FRAMES = slice(20, 101, 20)
-ENDS = (("proximal", "distal"), ("origin", "insertion"))
-
-
 BUTTON = {"model": "foundation", "resolution_mm": 1.0}
+STRANDS = RELEASED["ligament"][:2]
+INSIDE = bundle("inside", ("patella", 6.0, -21.0, -8.0), ("patella", 8.0, 20.0, 0.0), 20.0)
+TURNED = head("turned", 0.0, 0.0, 1.0)
+TURNED["origin"], TURNED["insertion"] = TURNED["insertion"], TURNED["origin"]
 
 
 def released_scene(folder, **changes):
@@ -139,6 +140,24 @@ def test_released_coordinates_are_those_of_the_scene(tmp_path):
     assert abs(results["patella_tilt_deg"][0]) > 1e-3
 
 
+def test_held_coordinates_do_not_come_from_the_frame_before(tmp_path):
+    held = released_scene(tmp_path, released=["tilt", "rotation"])
+    together = coordinates(tkamb.simulate(held, frames=slice(30, 71, 40)))
+    alone = coordinates(tkamb.simulate(held, frames=slice(70, 71)))
+    assert together[1] == pytest.approx(alone[0], abs=1e-5)
+    assert abs(together[1, 0] - together[0, 0]) > 1.0
+
+
+def test_a_patella_with_a_held_plane_is_flagged_if_its_contact_does_not_fit(scene, tmp_path):
+    held = released_scene(tmp_path, released=["ap", "tilt"])
+    results = tkamb.simulate(held, frames=slice(70, 71))
+    force, off = results["patellofemoral_N"][0], results["button_imbalance_N"][0]
+    assert off > 0.5 * force
+    assert f"differs by {off:.0f} N from the patellofemoral force" in results.status[0]
+    whole = tkamb.simulate(scene, frames=slice(70, 71))
+    assert "from the patellofemoral force" not in whole.status[0]
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -147,6 +166,9 @@ def test_released_coordinates_are_those_of_the_scene(tmp_path):
         ({"released": ["tild"]}, "released"),
         ({"ligament": RELEASED["ligament"][2:]}, "patella to the tibia"),
         ({"ligament": RELEASED["ligament"] * 2}, "named twice"),
+        ({"ligament": [*STRANDS, INSIDE]}, "inside: has both ends on the patella"),
+        ({"ligament": [*STRANDS, INSIDE | {"name": "LCL"}]}, r"'LCL' is in \[\[ligament"),
+        ({"head": [TURNED]}, "origin on the femur and an insertion on the patella"),
     ],
 )
 def test_tables_that_do_not_fit_are_refused(tmp_path, changes, words):
@@ -162,3 +184,112 @@ def test_a_lost_patella_is_in_the_status(tmp_path):
     assert "patella: " in results.status[0] and not results.status[0].startswith("failed")
     assert np.isnan(coordinates(results)).all() and np.isnan(results["button_force_N"][0])
     assert np.isfinite(results["force_total_N"][0])
+
+
+def test_check_describes_the_released_patella(tmp_path):
+    from tkamb.show.scene_check import check_scene
+
+    metres = copy.deepcopy(RELEASED["ligament"])
+    metres[0]["distal"]["point_mm"] = [0.038, 0.3928, -0.002]
+    lines = "\n".join(check_scene(released_scene(tmp_path, ligament=metres)).lines())
+    assert "30 % lateral" in lines and "retinaculum_medial" in lines
+    assert "out-of-plane motion of the patella" not in lines
+    assert "at the patella's pose in its sagittal plane" not in lines
+    assert "strand_medial distal: within 1 mm of the link's origin" in lines
+
+
+def test_a_second_computation_and_a_comparison_ignore_times(scene, tmp_path, capfd):
+    from tkamb.cli import main
+
+    out = str(tmp_path / "out")
+    assert main(["run", str(scene), "--frames", "40:61:20", "--out", out]) == 0
+    assert main(["verify", out, "--rerun"]) == 0
+    capfd.readouterr()
+    assert main(["compare", out, out, "--out", str(tmp_path / "compared")]) == 0
+    assert "button_contact_seconds" not in capfd.readouterr().out
+
+
+def test_errors_of_inputs_reach_the_released_patella(scene):
+    from tkamb.io.scene.case import load_case
+    from tkamb.studies.uncertainty.inputs import Draw, VariedInput
+    from tkamb.studies.uncertainty.sample import varied_case
+
+    case = load_case(tkamb.load_scene(scene))
+    errors = {
+        "femoral_placement.ap": (1.0, "mm"),
+        "tuberosity.si": (2.0, "mm"),
+        "muscle_attachment.quadriceps.insertion.ml": (3.0, "mm"),
+        "ligament_stiffness.strand_medial": (0.1, "relative"),
+    }
+    inputs = tuple(VariedInput(name, 1.0, unit) for name, (_, unit) in errors.items())
+    values = np.array([value for value, _ in errors.values()])
+    draw = Draw(inputs, values, np.zeros((len(case.motion.time), 0)), 1.0)
+    sample = varied_case(case, draw)
+    for old, new in zip(case.patella_heads, sample.patella_heads, strict=True):
+        moved = [
+            1e3 * (getattr(new, end).position - getattr(old, end).position)
+            for end in ("origin", "insertion")
+        ]
+        assert np.array(moved) == pytest.approx(np.array([[1, 0, 0], [0, 0, 3]]), abs=1e-9)
+    pairs = list(zip(case.patella_ligaments, sample.patella_ligaments, strict=True))
+    strand, retinaculum = pairs[0], pairs[2]
+    tibial = strand[1].distal.position - strand[0].distal.position
+    femoral = retinaculum[1].proximal.position - retinaculum[0].proximal.position
+    assert 1e3 * tibial == pytest.approx([0.0, 2.0, 0.0])
+    assert 1e3 * femoral == pytest.approx([1.0, 0.0, 0.0])
+    factor = draw.factor("ligament_stiffness.strand_medial")
+    assert strand[1].law.stiffness == pytest.approx(factor * strand[0].law.stiffness)
+    assert abs(factor - 1.0) > 0.1
+    assert retinaculum[1].law.stiffness == retinaculum[0].law.stiffness
+
+
+def test_a_sample_with_a_reference_strain_has_all_frames(scene, tmp_path):
+    """A strand's reference strain belongs to a frame that a thinned motion may not have."""
+    from tkamb.io.scene.case import load_case
+    from tkamb.studies.uncertainty.sample import thinnable
+
+    strands = [one | {"reference_strain": 0.03} for one in RELEASED["ligament"]]
+    for one in strands:
+        del one["slack_length_mm"]
+    assert thinnable(load_case(tkamb.load_scene(scene)))
+    assert not thinnable(load_case(tkamb.load_scene(released_scene(tmp_path, ligament=strands))))
+
+
+def test_a_patella_that_its_lines_lift_off_is_in_the_status(tmp_path):
+    lifts = [
+        bundle(f"lift_{k}", ("femur", 103.0, y, z), ("patella", 8.0, y, z), 200.0)
+        for k, (y, z) in enumerate(((15.0, 0.0), (-10.0, -10.0), (-10.0, 10.0)))
+    ]
+    held = {"released": ["ap"], "ligament": [*RELEASED["ligament"], *lifts]}
+    results = tkamb.simulate(released_scene(tmp_path, **held), frames=slice(5, 6))
+    assert "the button is not in contact" in results.status[0]
+    assert np.isnan(coordinates(results)).all() and np.isnan(results["button_force_N"][0])
+
+
+def test_a_failed_run_has_the_columns_of_the_button(tmp_path):
+    """The button lies 50 mm behind its place, so that no frame has a patellofemoral force."""
+    path = released_scene(tmp_path, motion="recorded")
+    text = path.read_text(encoding="utf-8")
+    behind = text.replace('patellar_button.stl"', 'patellar_button.stl", position_mm = [-50, 0, 0]')
+    assert behind != text
+    path.write_text(behind, encoding="utf-8")
+    results = tkamb.simulate(path, frames=slice(40, 41))
+    assert results.status[0].startswith("failed")
+    assert np.isnan(results["button_force_N"][0]) and np.isnan(results["patella_tilt_deg"][0])
+
+
+def test_live_leaves_the_patella_out(scene, tmp_path):
+    from tkamb.io.scene.case import load_case
+    from tkamb.show.view.live import LiveKnee
+
+    released, plane = (
+        LiveKnee(load_case(tkamb.load_scene(path)))
+        for path in (scene, write_scene(tmp_path / "plane"))
+    )
+    mine, other = (knee.answer(knee.recorded(40)) for knee in (released, plane))
+    assert not mine.failed
+    for name, value in other.numbers.items():
+        if not name.endswith("_seconds"):
+            assert mine.numbers[name] == pytest.approx(value, rel=1e-9, nan_ok=True), name
+    results = tkamb.simulate(released.save(released.recorded(40), tmp_path / "kept"))
+    assert not any(name.startswith("button") for name in results.columns)

@@ -191,6 +191,11 @@ class Button:
                     f"{EDGE_REACH / MILLIMETRE:g} mm): the button leaves the flange or lies over "
                     "the edge of the notch"
                 )
+        yield from self.imbalance_flags(press)
+
+    @staticmethod
+    def imbalance_flags(press: ButtonPress) -> Iterator[str]:
+        """Flag a contact whose force is not the patellofemoral force, if this is known."""
         size = float(np.linalg.norm(press.force))
         if press.imbalance > max(LARGE_IMBALANCE * size, LIGHT_IMBALANCE):
             yield (

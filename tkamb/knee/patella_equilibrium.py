@@ -125,16 +125,18 @@ def found_patella(
         return FoundPatella(balance, flags=tuple(flags), problem=balance.problem)
     if balance.residual > LARGEST_RESIDUAL * size:
         flags.append(
-            f"patella: a residual of {balance.residual:.2g} N remains, because the force of the "
-            "contact jumps there from facet to facet"
+            f"patella: a residual of {balance.residual:.2g} N remains: the contact's force jumps "
+            "there from facet to facet, or its model's solver is no more exact"
         )
     began, button = clock.perf_counter(), body.button
     contact = button.contact.model.evaluate(
         button.contact.state, body.femur_in_button(balance.coordinates)
     )
-    if contact.status is not ContactStatus.OK:
-        problem = f"patella: {contact.reason}"
-        return FoundPatella(balance, flags=tuple(flags), problem=problem)
+    problem = "" if contact.status is ContactStatus.OK else contact.reason
+    if not problem and not (contact.pressure > 0.0).any():
+        problem = "its lines hold it off the femur: the button is not in contact"
+    if problem:
+        return FoundPatella(balance, flags=tuple(flags), problem=f"patella: {problem}")
     poses = body.poses | {"patella": body.patella(balance.coordinates)}
     press = ButtonPress(np.full(3, np.nan), poses["patella"] @ button.in_patella, contact)
     press = replace(press, flags=button.flags(press), seconds=clock.perf_counter() - began)

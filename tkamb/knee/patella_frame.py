@@ -11,7 +11,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 from tkamb.errors import ComputationError
-from tkamb.geometry.frames import Array, inverse, transform
+from tkamb.geometry.frames import PATELLA_BODY_COORDINATES, Array, inverse, transform
 from tkamb.knee.button import Button
 from tkamb.knee.chain import Chain
 from tkamb.knee.ligaments import Ligament
@@ -83,7 +83,8 @@ class PatellaMethod:
             tension: tension of the quadriceps, N.
             force: patellofemoral force of the equations on the patella, insert frame, shape (3,),
                 N. It presses the plane patella, the initial guess.
-            start: coordinates (6,) of the patella in the last frame; None: unknown.
+            start: coordinates (6,) of the patella in the last frame, the first guess if all are
+                released; None: unknown.
 
         Raises:
             ComputationError: the quadriceps is slack, or the plane patella cannot be pressed.
@@ -105,9 +106,17 @@ class PatellaMethod:
         probe = self.button.contact.probe()
         body = PatellaBody(self.button, probe, joint, heads, self._carried, poses)
         plane = coordinates_of(inverse(poses["femur"] @ joint) @ state.pose("patella"))
-        guesses: list[Callable[[], Array]] = [] if start is None else [lambda: start]
+        guesses: list[Callable[[], Array]] = []
+        # Coordinates that are not released keep the values of this frame's plane patella.
+        if start is not None and len(self.released) == len(PATELLA_BODY_COORDINATES):
+            guesses.append(lambda: start)
         guesses.append(lambda: pressed_coordinates(body, plane[list(PLANE)], force))
         found = found_patella(body, guesses, released_numbers(self.released))
         if found.press is None:
             return found
-        return replace(found, press=replace(found.press, force=force))
+        press = replace(found.press, force=force)
+        if not {PATELLA_BODY_COORDINATES[k] for k in PLANE} <= set(self.released):
+            # The held coordinates of the plane do not let the contact find its force.
+            flags = (*press.flags, *self.button.imbalance_flags(press))
+            press = replace(press, flags=flags)
+        return replace(found, press=press)

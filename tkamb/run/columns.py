@@ -65,6 +65,9 @@ FAMILIES = (
 )
 """Each family has one column per ligament, muscle or coordinate."""
 
+SECONDS = "_seconds"
+"""Ending of the columns of computing times, which differ from run to run."""
+
 COLUMNS: tuple[Column, ...] = (
     Column("time_s", "time of the frame"),
     Column("flexion_deg", "knee flexion (Grood-Suntay)"),

@@ -73,7 +73,7 @@ def frame_row(
     row = motion | _body_row(case, frame)
     for side, slip in slips.items():
         row |= _slip_row(case, k, side, slip, frame.geometry.condyles.get(side))
-    if frame.button is not None:
+    if case.scene.contact is not None and case.scene.contact.patellofemoral is not None:
         row |= _button_row(frame.button)
     if case.patella_ligaments:
         row |= _patella_row(case, frame.patella)
@@ -284,11 +284,13 @@ def _post_row(post: "PostContact") -> dict[str, float]:
     }
 
 
-def _button_row(press: "ButtonPress") -> dict[str, float]:
+def _button_row(press: "ButtonPress | None") -> dict[str, float]:
     """Return force, area, pressure and place of the button's contact; NaN without contact."""
     names = [each.name.removeprefix("button_") for each in COLUMNS if each.needs == BUTTON_NEEDS]
-    values = dict.fromkeys(names, NAN) | {"contact_seconds": press.seconds}
-    if press.contact is not None:
+    values = dict.fromkeys(names, NAN)
+    if press is not None:
+        values["contact_seconds"] = press.seconds
+    if press is not None and press.contact is not None:
         facets = [facet for facet in press.facets.values() if facet is not None]
         force, area = (sum(getattr(f, name) for f in facets) for name in ("force", "area"))
         weights = [facet.force / force for facet in facets]

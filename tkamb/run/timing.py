@@ -77,6 +77,7 @@ CLOCKS = {
     "closest points": "query_seconds",
     "equations of motion": "body_seconds",
     "contact": "contact_seconds",
+    "contact of the button": "button_contact_seconds",
 }
 
 
@@ -104,7 +105,8 @@ class Profile:
         seconds = dict(results.summary["seconds"])
         total = seconds.pop("all")
         for name, column in CLOCKS.items():
-            finite = [float(value) for value in results[column] if math.isfinite(value)]
+            values = results.columns.get(column, ())
+            finite = [float(value) for value in values if math.isfinite(value)]
             if finite:
                 seconds[name] = sum(finite)
         seconds["all else"] = max(0.0, total - sum(seconds.values()))

@@ -11,7 +11,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, Index
 from tkamb.run import metrics
 from tkamb.run.claims import peaks_of
-from tkamb.run.columns import KINDS
+from tkamb.run.columns import KINDS, SECONDS
 from tkamb.run.identity import CONTACT_CODE
 from tkamb.run.metrics import failed
 from tkamb.run.results import Results
@@ -97,7 +97,6 @@ def _same_frames(
     return result if near.all() else None
 
 
-NOT_COMPARED = ("time_s", "body_seconds", "query_seconds", "contact_seconds")
 SETTINGS = {
     "side": "side",
     "lateral_axis": "direction of insert z",
@@ -261,7 +260,9 @@ def differences(first: Run, run: Run) -> list[Difference]:
         return []
     result = []
     for column, values in first.results.columns.items():
-        if KINDS.get(column, "number") != "number" or column in NOT_COMPARED:
+        if KINDS.get(column, "number") != "number":
+            continue
+        if column == "time_s" or column.endswith(SECONDS):
             continue
         if column not in run.results.columns:
             continue

@@ -206,7 +206,14 @@ def _listed(names: Sequence[str]) -> str:
 def _extensor(case: Case) -> Entry:
     assert case.scene.patella is not None
     names = ", ".join(muscle.name for muscle in case.muscles)
-    return Entry("muscle line", None, f"{names}; patella's motion {case.scene.patella.motion}")
+    text = f"{names}; patella's motion {case.scene.patella.motion}"
+    if released := case.scene.patella.released:
+        heads = [f"{100 * head.share:.3g} % {head.name}" for head in case.patella_heads]
+        text += (
+            f"; released: {', '.join(released)}; heads: {', '.join(heads) or names}; ligaments of "
+            f"the patella: {', '.join(one.name for one in case.patella_ligaments)}"
+        )
+    return Entry("muscle line", None, text)
 
 
 def _contact(case: Case) -> Entry:
@@ -346,6 +353,8 @@ def _missing(case: Case) -> tuple[str, ...]:
 
 def _beyond(case: Case) -> list[str]:
     muscles = [] if case.scene.muscles else ["muscles other than the quadriceps"]
-    patella = ["out-of-plane motion of the patella"] if case.scene.patella else []
+    table = case.scene.patella
+    plane = table is not None and not {"shift", "tilt", "rotation"} & set(table.released)
+    patella = ["out-of-plane motion of the patella"] if plane else []
     post = [] if case.post is not None else ["cam–post contact"]
     return [*muscles, *patella, *post, "wear and creep (`tkamb wear`)"]

@@ -220,8 +220,8 @@ def read_patella_lines(
     """Return the heads of the quadriceps and the ligaments of a released patella.
 
     Raises:
-        InputError: a head does not run from the femur to the patella, a ligament has no end on the
-            patella, or none runs to the tibia.
+        InputError: a head does not run from the femur to the patella, a ligament has no end or both
+            ends on the patella, or none runs to the tibia.
     """
     table, is_left = scene.patella, scene.patient.side == "left"
     if table is None or not table.released:
@@ -240,6 +240,10 @@ def read_patella_lines(
         if "patella" not in links:
             where = f"[[patella.ligament]] {name}"
             raise InputError("has no end on the patella", where, "give it as [[ligament]]")
+        if len(links) < 2:
+            where = f"[[patella.ligament]] {name}"
+            hint = "let one end be on the tibia or the femur"
+            raise InputError("has both ends on the patella", where, hint)
     if not any({"patella", "tibia"} <= links for links in joined.values()):
         hint = "give strands of the patellar ligament"
         raise InputError("none runs from the patella to the tibia", "[[patella.ligament]]", hint)
@@ -253,7 +257,8 @@ def read_patella_lines(
         ends = [chain.carrier(end.link) for end in (head.origin, head.insertion)]
         if ends != ["femur", "patella"]:
             where = f"[[patella.head]] {head.name}"
-            raise InputError(f"runs from {ends[0]} to {ends[1]}", where, "femur to patella")
+            hint = "give an origin on the femur and an insertion on the patella"
+            raise InputError(f"runs from {ends[0]} to {ends[1]}", where, hint)
     return heads, lines
 
 

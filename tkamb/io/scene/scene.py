@@ -114,6 +114,9 @@ class Scene(SceneTable):
         names = [ligament.name for ligament in self.ligament]
         if len(names) != len(set(names)):
             raise ValueError("two [[ligament]] tables have the same name")
+        for name in [one.name for one in self.patella.ligament] if self.patella else []:
+            if name in names:
+                raise ValueError(f"'{name}' is in [[ligament]] and in [[patella.ligament]]")
         generic = self.generic_ligaments.ligaments if self.generic_ligaments else ()
         for name in names:
             if name.removeprefix("generic_").startswith(generic):

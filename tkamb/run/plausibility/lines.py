@@ -64,7 +64,7 @@ def attachment_questions(case: Case) -> Iterator[Question]:
     """Ask about attachments in metres instead of millimetres, or far from the knee."""
     ends = [
         (f"{bundle.name} {side}", getattr(bundle, side))
-        for bundle in case.ligaments
+        for bundle in (*case.ligaments, *case.patella_ligaments)
         for side in ("proximal", "distal")
     ]
     far = [name for name, end in ends if not _is_plausible_end(*_on_carrier(case, end))]
@@ -78,6 +78,8 @@ def attachment_questions(case: Case) -> Iterator[Question]:
         ends += [(f"[{muscle.name}] origin", muscle.points[0])]
         ends += [(f"[{muscle.name}] via point", point) for point in muscle.points[1:-1]]
         ends += [(f"[{muscle.name}] insertion", muscle.points[-1])]
+    for head in case.patella_heads:
+        ends += [(f"{head.name} origin", head.origin), (f"{head.name} insertion", head.insertion)]
     if case.patellar_ligament:
         ends += [
             ("[patellar_ligament] proximal", case.patellar_ligament.proximal),

@@ -270,6 +270,7 @@ class Bench:
                 "released": request.released,
                 "coupling": "none",
                 "adjust": False,
+                "patellofemoral": None,
                 "options": scene.contact.options if request.contact == scene.contact.model else {},
             }
         )
@@ -296,6 +297,8 @@ class Bench:
             patella=None,
             muscles=(),
             patellar_ligament=None,
+            patella_heads=(),
+            patella_ligaments=(),
             measured=None,
             emg=None,
             ligaments=tuple(self._bundle(one, request) for one in self.bundles),

@@ -434,6 +434,16 @@ def _numbers(frame: Frame, recording: Recording, lengths: dict[str, float]) -> d
 def _without_muscles(case: Case) -> Case:
     """Return the case without muscles and patella: bones, ligaments and contact remain."""
     chain = Chain(load_urdf(case.scene.patient, False), False)
-    update = {"patella": None, "muscles": None, "quadriceps": None, "muscle": ()}
-    scene = case.scene.model_copy(update=update)
-    return replace(case, scene=scene, chain=chain, muscles=(), patellar_ligament=None, patella=None)
+    update: dict[str, Any] = {"patella": None, "muscles": None, "quadriceps": None, "muscle": ()}
+    if case.scene.contact is not None:
+        update["contact"] = case.scene.contact.model_copy(update={"patellofemoral": None})
+    return replace(
+        case,
+        scene=case.scene.model_copy(update=update),
+        chain=chain,
+        muscles=(),
+        patellar_ligament=None,
+        patella=None,
+        patella_heads=(),
+        patella_ligaments=(),
+    )

@@ -10,16 +10,13 @@ from numpy.typing import NDArray
 from tkamb.errors import TkambError
 from tkamb.geometry.frames import Array
 from tkamb.geometry.memory import give_back
-from tkamb.run.columns import KINDS
+from tkamb.run.columns import KINDS, SECONDS
 from tkamb.run.metrics import lateral_axis_name, map_rows
 from tkamb.run.recorder import Shard
 from tkamb.run.results import Results
 from tkamb.run.simulation import simulate
 from tkamb.run.status import FAILED
 from tkamb.studies.cohort.plan import CohortRun, CohortWearTable
-
-TIMES = "_seconds"
-"""Ending of the columns of computing times, which differ between computers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +139,7 @@ class CohortWorker:
             name: values
             for name, values in results.columns.items()
             if KINDS.get(name) != "text"
-            and not name.endswith(TIMES)
+            and not name.endswith(SECONDS)
             and name not in results.not_modelled
         }
         result = Outcome("", columns, results.status, chosen_map(results, self._map_flexion))

@@ -168,7 +168,7 @@ def _wrapped_tendons(case: Case) -> list[str]:
 
 def _tissue_inputs(case: Case, table: UncertaintyTable) -> list[VariedInput]:
     inputs = []
-    for bundle in case.ligaments:
+    for bundle in (*case.ligaments, *case.patella_ligaments):
         stiffness = f"ligament_stiffness.{bundle.name}"
         inputs.append(VariedInput(stiffness, table.ligament_stiffness, "relative"))
         strain = f"ligament_strain.{bundle.name}"

@@ -32,7 +32,7 @@ from tkamb.io.recordings.recording_tables import MarkerSegmentTable
 from tkamb.io.scene import Scene
 from tkamb.io.scene.case import Case, load_case
 from tkamb.knee.frame import FrameStart
-from tkamb.knee.ligaments import Ligament
+from tkamb.knee.ligaments import DISTAL, PROXIMAL, Ligament
 from tkamb.knee.load import LinkPoint
 from tkamb.knee.muscles import Muscle, SagittalWrap
 from tkamb.knee.wrap_object import WrapObject
@@ -61,6 +61,7 @@ if TYPE_CHECKING:
     from tkamb.io.recordings.ground_reaction import GroundReaction
     from tkamb.io.recordings.motion import KneeMotion
     from tkamb.io.recordings.tibia import BodyMotion
+    from tkamb.knee.patella_frame import HeadShare
 
 
 def varied_case(case: Case, draw: Draw) -> Case:
@@ -82,6 +83,10 @@ def varied_case(case: Case, draw: Draw) -> Case:
     )
     changes["ligaments"] = tuple(_ligament(case, bundle, draw) for bundle in case.ligaments)
     changes["muscles"] = tuple(_muscle(case, muscle, draw) for muscle in case.muscles)
+    changes["patella_heads"] = tuple(_head(case, head, draw) for head in case.patella_heads)
+    changes["patella_ligaments"] = tuple(
+        _strand(_ligament(case, bundle, draw), case, draw) for bundle in case.patella_ligaments
+    )
     if case.patellar_ligament is not None:
         end = case.patellar_ligament.distal
         distal = LinkPoint(end.link, end.position + draw.place("tuberosity"))
@@ -155,6 +160,27 @@ def _ligament(case: Case, bundle: Ligament, draw: Draw) -> Ligament:
     )
 
 
+def _strand(bundle: Ligament, case: Case, draw: Draw) -> Ligament:
+    """Return a ligament of the patella whose tibial end has the error of the tuberosity."""
+    ends: dict[str, Any] = {end: getattr(bundle, end) for end in (PROXIMAL, DISTAL)}
+    for name, point in ends.items():
+        if case.chain.carrier(point.link) == "tibia":
+            ends[name] = LinkPoint(point.link, point.position + draw.place("tuberosity"))
+    return replace(bundle, **ends)
+
+
+def _head(case: Case, head: "HeadShare", draw: Draw) -> "HeadShare":
+    """Return a head whose ends have the errors of the quadriceps' line."""
+    (line,) = case.muscles
+    shifts = [draw.place(f"muscle_attachment.{line.name}.{end}") for end in LINE_ENDS]
+    origin, insertion = _on_femur(case, head.origin, draw), head.insertion
+    return replace(
+        head,
+        origin=LinkPoint(origin.link, origin.position + shifts[0]),
+        insertion=LinkPoint(insertion.link, insertion.position + shifts[1]),
+    )
+
+
 def _muscle(case: Case, muscle: Muscle, draw: Draw) -> Muscle:
     points = [_on_femur(case, point, draw) for point in muscle.points]
     for k, end in zip((0, -1), LINE_ENDS, strict=True):
@@ -207,7 +233,8 @@ def thinnable(case: Case) -> bool:
     which it refers.
     """
     solved = case.scene.patella is not None and case.scene.patella.motion == "solved"
-    return not solved and all(np.isfinite(bundle.slack_length) for bundle in case.ligaments)
+    bundles = (*case.ligaments, *case.patella_ligaments)
+    return not solved and all(np.isfinite(bundle.slack_length) for bundle in bundles)
 
 
 def thinned(case: Case, frames: range) -> Case:
