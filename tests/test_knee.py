@@ -420,6 +420,7 @@ def test_inconsistent_arguments_are_refused_in_one_line(read):
         (lambda: bare.press(q, 1.0), "no contact"),
         (lambda: bare.inverse_dynamics(q, v, 0 * v, contact=knee.press(q, 500.0)), "no contact"),
         (lambda: knee.equilibrium(q, v, v, None, ("flexion",)), "no coordinate"),
+        (lambda: knee.equilibrium(q, v, v, None, "ap"), "is the text 'ap'"),
         (lambda: tkamb.contact_model("lattice", resolution=1.0), "resolution"),
     ]
     for call, words in cases:

@@ -244,6 +244,8 @@ def test_what_is_wrong_with_the_patella_is_in_words(plain, knee):
     assert sides_without_head({"a": np.array([0, 0, 0.01])}, {"a": 0.0}) == []
     with pytest.raises(InputError, match="no coordinate 'tild'"):
         knee.patella_equilibrium(q, HEADS, released=("tild",))
+    with pytest.raises(InputError, match="is the text 'tilt'"):
+        knee.patella_equilibrium(q, HEADS, released="tilt")
     with pytest.raises(InputError, match="no head of the quadriceps pulls"):
         knee.patella_equilibrium(q, 0.0)
     with pytest.raises(InputError, match="no strand"):

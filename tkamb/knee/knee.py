@@ -693,6 +693,10 @@ class Knee(AssembledKnee):
         from tkamb.knee.released import ReleasedKnee
 
         contact, allowed = self._need_contact(), [n for n in KNEE_COORDINATES if n != "flexion"]
+        if isinstance(released, str):
+            raise InputError(
+                f"is the text '{released}'", "released", f'give a list: ["{released}"]'
+            )
         for name in released:
             if name not in allowed:
                 raise InputError(f"no coordinate '{name}'", "released", names_near(name, allowed))

@@ -350,6 +350,8 @@ def released_numbers(names: Sequence[str]) -> tuple[int, ...]:
     Raises:
         InputError: a name is unknown, given twice, or there is none.
     """
+    if isinstance(names, str):
+        raise InputError(f"is the text '{names}'", "released", f'give a list: ["{names}"]')
     for name in names:
         if name not in PATELLA_BODY_COORDINATES:
             hint = names_near(name, list(PATELLA_BODY_COORDINATES))
