@@ -120,8 +120,10 @@ def test_unreadable_files_are_refused(tmp_path):
 
 
 def test_a_coordinate_that_is_not_a_number_is_refused(tmp_path):
-    bad = plate()
-    bad.vertices[3, 1] = np.nan
+    shared = plate()  # other tests use it, too
+    vertices = shared.vertices.copy()
+    vertices[3, 1] = np.nan
+    bad = Surface(vertices, shared.faces)
     refused("not a number", save(tmp_path / "bad.stl", bad), "mm")
 
 
