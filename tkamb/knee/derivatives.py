@@ -42,7 +42,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pinocchio as pin
 
-from tkamb.geometry.frames import Array
+from tkamb.geometry.frames import Array, displaced
 from tkamb.knee.anatomy import FixedFrame
 from tkamb.knee.canonical import KneePose, mirrored_spatial, summed
 
@@ -58,6 +58,9 @@ POSE_STEP = 1e-6
 # m: step of the patella's coordinates. Chosen shorter, because the facets under the button are
 # short.
 PATELLA_STEP = 1e-7
+# 1: relative difference of one-sided differences from which an edge of a facet lies between them.
+# Measured in 30 states: median 4e-5 by `POSE_STEP` and 5e-6 by `PATELLA_STEP`.
+EDGE = 3e-4
 # m: lever arm; a rotation's step is the step over this arm. Chosen as half the distance of the
 # condyles.
 FORCE_DERIVATIVE_ARM = 0.025
@@ -335,18 +338,32 @@ def _patella_slopes(knee: "Knee", kinematics: KneePose, patella: "PatellaState")
 
 def _pose_differences(values: Callable[[Array], Array], pose: Array) -> Array:
     """Return the derivative (n, 6) of values (n,) by a displacement of the femur."""
-    from tkamb.knee.contact import DifferenceSettings, differences
-
-    settings = DifferenceSettings(step=POSE_STEP, arm=FORCE_DERIVATIVE_ARM)
-    return differences(values, pose, settings)
+    sizes = np.repeat([1.0, 1.0 / FORCE_DERIVATIVE_ARM], 3)
+    return _edge_free(lambda move: values(displaced(pose, move)), sizes, POSE_STEP)
 
 
 def _patella_differences(values: Callable[[Array], Array], coordinates: Array) -> Array:
     """Return the derivative (n, 3) of values (n,) by the patella's coordinates."""
-    step, columns = PATELLA_STEP, []
-    for k, size in enumerate((step, step, step / FORCE_DERIVATIVE_ARM)):
-        move = size * np.eye(3)[k]
-        columns.append((values(coordinates + move) - values(coordinates - move)) / (2.0 * size))
+    sizes = np.array([1.0, 1.0, 1.0 / FORCE_DERIVATIVE_ARM])
+    return _edge_free(lambda move: values(coordinates + move), sizes, PATELLA_STEP)
+
+
+def _edge_free(values: Callable[[Array], Array], sizes: Array, step: float) -> Array:
+    """Return the derivative (n, k) of values (n,) by k coordinates, by central differences.
+
+    If the two one-sided differences of a coordinate differ by more than `EDGE`, an edge of a facet
+    lies within the step: a tenth of the step is tried, then a hundredth.
+    """
+    here, columns = values(np.zeros(len(sizes))), []
+    for k, size in enumerate(sizes):
+        for share in (1.0, 0.1, 0.01):
+            move = share * step * size
+            ahead, behind = (values(sign * move * np.eye(len(sizes))[k]) for sign in (1.0, -1.0))
+            column = (ahead - behind) / (2.0 * move)
+            bend = (ahead - 2.0 * here + behind) / move
+            if np.linalg.norm(bend) <= EDGE * np.linalg.norm(column):
+                break
+        columns.append(column)
     return np.array(columns).T
 
 
