@@ -199,6 +199,13 @@ class MethodError:
         return max(errors, key=abs)
 
     @property
+    def headline(self) -> str:
+        """Errors of the peak and RMS error of the total force, if the activity was measured."""
+        if not self.same_activity:
+            return "not measured"
+        return f"peak {abs(self.peak_error):.2f}, RMS {self.rmse('total'):.2f} BW"
+
+    @property
     def sentences(self) -> list[str]:
         """Sentences on the errors, first on an activity without a measurement."""
         return texts.lines("tkamb.run", "error.txt", error=self, groups=self.groups)

@@ -160,11 +160,8 @@ def _method_cards(cohort: Cohort, outcomes: Mapping[int, Outcome]) -> list[Card]
     cards = []
     for activity, muscles in cases:
         error = method_error({"activity": activity, "scene_tables": {"muscles": muscles}})
-        known = error.same_activity
-        number = f"peak {abs(error.peak_error):.2f}, RMS {error.rmse('total'):.2f} BW"
         title = f"Error of this method: {activity or 'activity not stated'}"
-        detail = " ".join(error.sentences)
-        cards.append(Card(title, number if known else "not measured", detail, warning=True))
+        cards.append(Card(title, error.headline, " ".join(error.sentences), warning=True))
     return cards
 
 
