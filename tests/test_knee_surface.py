@@ -247,6 +247,51 @@ def test_angles_in_degrees_and_numbers_that_are_not_finite_are_refused(read):
             call()
 
 
+def test_an_argument_of_a_wrong_kind_is_refused_by_name(read):
+    knee, motion, _ = read
+    q, v, model = motion.q[60], motion.v[60], knee.model
+
+    def ligament(**changes):
+        ends = {"proximal": ("femur", (0.0, 0.0, -0.04)), "distal": ("tibia", (0.0, 0.36, -0.03))}
+        law = {"law": tkamb.TwoLine(stiffness=3e4), "slack_length": 0.085}
+        return tkamb.Ligament("MCL", **{**ends, **law, **changes})
+
+    for where, call in (
+        ("press: load: cannot be '100'", lambda: knee.press(q, "100")),
+        ("press: load: cannot be None", lambda: knee.press(q, None)),
+        ("q: cannot be an array of complex128", lambda: knee.external_forces(q + 0j, v)),
+        ("q: cannot be 'abc'", lambda: knee.evaluate("abc")),
+        ("quadriceps: tension: cannot be 'x'", lambda: knee.external_forces(q, v, "x")),
+        ("with_contact: 3 is no contact model", lambda: knee.with_contact(3)),
+        ("no contact model 'foundatoin'", lambda: knee.with_contact("foundatoin")),
+        ("ligaments: cannot be 3", lambda: knee.with_ligaments([3])),
+        (
+            "slack_length: cannot be '0.08'",
+            lambda: knee.with_ligaments([ligament(slack_length="0.08")]),
+        ),
+        ("wraps: cannot be 3", lambda: knee.with_ligaments([ligament(wraps=3)])),
+        ("model: cannot be 'leg.urdf'", lambda: tkamb.Knee("leg.urdf")),
+        ("implant: cannot be 'x'", lambda: tkamb.Knee(model, implant="x")),
+        ("extensor: cannot be 3", lambda: tkamb.Knee(model, extensor=3)),
+        ("friction: cannot be '0'", lambda: tkamb.Knee(model, friction="0")),
+        ("frames: cannot be 3", lambda: tkamb.Knee(model, frames={"femur": 3})),
+        ("muscles: cannot be 3", lambda: tkamb.Knee(model, muscles=[3])),
+        ("resolution: cannot be '2'", lambda: tkamb.contact_model("hertz", resolution="2")),
+        ("frames: cannot be '0:3'", lambda: tkamb.simulate(SCENE, frames="0:3")),
+        ("contact: cannot be 3", lambda: tkamb.simulate(SCENE, contact=3)),
+        ("read_results: cannot be 3", lambda: tkamb.read_results(3)),
+        ("plot: cannot be 'out'", lambda: tkamb.plot("out")),
+        ("live: cannot be 3", lambda: tkamb.live(3)),
+    ):
+        with pytest.raises(InputError, match=re.escape(where)):
+            call()
+    foundation = knee.with_contact("foundation")
+    assert foundation.contact.model == tkamb.contact_model("foundation")
+    implant = replace(knee.implant, bearing="moblie")
+    with pytest.raises(InputError, match="bearing 'moblie'; give 'fixed' or 'mobile'"):
+        tkamb.Knee(model, implant=implant, contact="foundation")
+
+
 def test_a_quaternion_that_is_not_normalised_is_refused(sides):
     (knee, q, v, a, fext), _ = sides
     long = q.copy()

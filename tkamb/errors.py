@@ -2,9 +2,16 @@
 
 import difflib
 from collections.abc import Iterable
+from typing import Any, TypeVar
+
+import numpy as np
+
+Kind = TypeVar("Kind")
 
 # Largest number of names in a message. A message should be short.
 MAX_NAMES = 8
+# Largest number of characters of a value in a message.
+MAX_SHOWN = 60
 
 
 class TkambError(Exception):
@@ -37,6 +44,51 @@ class InputError(TkambError):
 
 class ComputationError(TkambError):
     """The input is valid, but nothing could be computed: exit status 1."""
+
+
+def must_be(value: object, kinds: type | tuple[type, ...], where: object, hint: str) -> None:
+    """Raise an InputError if an argument is of none of the kinds."""
+    if not isinstance(value, kinds):
+        shown = repr(value)
+        shown = shown if len(shown) < MAX_SHOWN else f"a {type(value).__name__}"
+        raise InputError(f"cannot be {shown}", where, hint)
+
+
+def all_of(kind: type[Kind], values: Iterable[Kind], where: str, hint: str) -> tuple[Kind, ...]:
+    """Return the values of an argument; if one of them is of another kind, raise an InputError."""
+    must_be(values, Iterable, where, hint)
+    kept = tuple(values)
+    for value in kept:
+        must_be(value, kind, where, hint)
+    return kept
+
+
+def real_numbers(values: Any, where: object, hint: str) -> np.ndarray:
+    """Return an argument as an array of float; text, bool and complex numbers are refused.
+
+    Raises:
+        InputError: see above, or the rows have different lengths.
+    """
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise InputError(f"holds no numbers: {error}", where, hint) from None
+    if array.dtype.kind not in "fiu" and array.size:
+        shown = f"an array of {array.dtype}" if array.shape else repr(values)
+        raise InputError(f"cannot be {shown}", where, hint)
+    return array.astype(float, copy=False)
+
+
+def real_number(value: Any, where: object, hint: str) -> float:
+    """Return an argument as a float; all but one real number is refused.
+
+    Raises:
+        InputError: see above.
+    """
+    array = real_numbers(value, where, hint)
+    if array.shape:
+        must_be(value, (), where, hint)
+    return float(array)
 
 
 def not_installed(package: str, where: object, extra: str) -> InputError:

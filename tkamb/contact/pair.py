@@ -4,12 +4,13 @@ import copy
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
 from tkamb.contact.flags import ArticularEdge
 from tkamb.contact.materials import Material
+from tkamb.errors import InputError
 from tkamb.geometry.condyles import condyle_split
 from tkamb.geometry.first_touch import FirstTouch, Touch
 from tkamb.geometry.frames import Array, Index
@@ -41,6 +42,10 @@ class ContactPair:
     insert: Surface
     material: Material
     bearing: Bearing = "fixed"
+
+    def __post_init__(self) -> None:
+        if self.bearing not in get_args(Bearing):
+            raise InputError(f"bearing {self.bearing!r}", "Implant", "give 'fixed' or 'mobile'")
 
     @cached_property
     def split(self) -> float | None:

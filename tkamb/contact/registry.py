@@ -13,7 +13,7 @@ from dataclasses import fields
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from tkamb.contact.model import ContactModel
-from tkamb.errors import InputError, names_near
+from tkamb.errors import InputError, must_be, names_near, real_number
 from tkamb.named_classes import NamedClasses
 from tkamb.units import MILLIMETRE
 
@@ -81,7 +81,9 @@ def contact_model(
         InputError: the name, an option or the value of an option is unknown; the resolution is not
             positive or too coarse.
     """
+    must_be(name, str, "contact model", f"give its name: {', '.join(contact_names())}")
     cls, where = contact_class(name), f"contact model '{name}'"
+    resolution = real_number(resolution, f"{where}: resolution", "give it in metres")
     if not (math.isfinite(resolution) and 0 < resolution <= COARSEST):
         most = COARSEST
         hint = f"give more than 0, at most {most / MILLIMETRE:g} mm ({most:g} m)"

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 import pinocchio as pin
 
-from tkamb.errors import InputError, names_near
+from tkamb.errors import InputError, must_be, names_near
 
 NEEDED = ("femur", "tibia")
 """Parts of the knee whose frames a model must have."""
@@ -211,6 +211,7 @@ def _missing(model: pin.Model, part: str) -> InputError:
 
 def _frame(model: pin.Model, name: str, part: str | None = None) -> FixedFrame:
     """Return the frame with a name; of several frames with this name, the frame of a body."""
+    must_be(name, str, "frames", "give names of frames of the model")
     if not model.existFrame(name):
         names = [frame.name for frame in model.frames]
         hint = names_near(name, names)

@@ -4,12 +4,20 @@ import copy
 import uuid
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import NoneType
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 import pinocchio as pin
 
-from tkamb.errors import ComputationError, InputError
+from tkamb.errors import (
+    ComputationError,
+    InputError,
+    all_of,
+    must_be,
+    real_number,
+    real_numbers,
+)
 from tkamb.geometry.frames import (
     Array,
     inverse,
@@ -24,6 +32,7 @@ from tkamb.knee.muscles import Muscle, checked_tensions, tension_lines
 from tkamb.knee.parts import (
     Extensor,
     Implant,
+    as_model,
     bundle_on_chain,
     check_names,
     crossing_and_others,
@@ -116,11 +125,16 @@ class AssembledKnee:
         cache: bool = False,
         patellofemoral_contact: "ContactModel | str | None" = None,
     ) -> None:
+        must_be(model, pin.Model, "Knee: model", "give a pin.Model")
+        must_be(implant, (Implant, NoneType), "Knee: implant", "give a tkamb.Implant")
+        must_be(extensor, (Extensor, NoneType), "Knee: extensor", "give a tkamb.Extensor")
+        must_be(frames, (Mapping, NoneType), "Knee: frames", "give part -> name of a frame")
         if side not in ("right", "left"):
             raise InputError(f"side {side!r}", "Knee", "give 'right' or 'left'")
-        if not 0.0 <= friction <= 1.0:
+        self.friction = real_number(friction, "Knee: friction", "give 0 to 1")
+        if not 0.0 <= self.friction <= 1.0:
             raise InputError(f"friction {friction}", "Knee", "give 0 to 1")
-        self.model, self.side, self.friction = model, side, float(friction)
+        self.model, self.side = model, side
         self.implant, is_left = implant or Implant(), side == "left"
         self.anatomy = find_anatomy(
             model, frames or {}, joints, _placement(extensor.plane) if extensor else None
@@ -132,8 +146,8 @@ class AssembledKnee:
         component = self.anatomy.femoral
         self.chain = CanonicalChain(self.anatomy, is_left, extensor is not None, component, insert)
         self.bridge = Bridge(self.anatomy, is_left, self.chain, component, insert)
-        self.extensor, self.muscles = extensor, tuple(muscles)
-        muscles = self.muscles
+        self.extensor = extensor
+        self.muscles = muscles = all_of(Muscle, muscles, "muscles", "give a list of tkamb.Muscle")
         check_names("muscles", [*self._extensor_names, *(muscle.name for muscle in muscles)])
         self._lines = tension_lines(muscles, self.anatomy)
         self._set_ligaments(ligaments)
@@ -155,7 +169,10 @@ class AssembledKnee:
         self._identity = _identity(self)
 
     def _set_ligaments(self, bundles: "Iterable[Ligament]") -> None:
-        self.ligaments = tuple(bundle_on_chain(self.bridge, bundle) for bundle in bundles)
+        from tkamb.knee.ligaments import Ligament
+
+        given = all_of(Ligament, bundles, "ligaments", "give a list of tkamb.Ligament")
+        self.ligaments = tuple(bundle_on_chain(self.bridge, bundle) for bundle in given)
         check_names("ligaments", [bundle.name for bundle in self.ligaments])
         self._crossing, self._others = crossing_and_others(self.chain, self.ligaments)
 
@@ -165,11 +182,11 @@ class AssembledKnee:
         other._set_ligaments(ligaments)
         return other
 
-    def with_contact(self, model: "ContactModel") -> Self:
+    def with_contact(self, model: "ContactModel | str") -> Self:
         """Return the same knee with another contact model, which is prepared at its first use."""
         from tkamb.knee.contact import KneeContact
 
-        other = copy.copy(self)
+        other, model = copy.copy(self), as_model(model, "with_contact")
         other.contact = KneeContact(model, self._need_contact().pair, self.friction)
         other._identity = _identity(other)
         return other
@@ -331,7 +348,7 @@ class AssembledKnee:
         return centres | ({"lateral": gaps.lateral.centre} if gaps.lateral else {})
 
     def _check(self, values: Array, name: str, size: int) -> Array:
-        array = np.asarray(values, float)
+        array = real_numbers(values, f"Knee: {name}", f"give ({size},)")
         if array.shape != (size,):
             raise InputError(f"{name} has the shape {array.shape}", "Knee", f"give ({size},)")
         # Comparisons with NaN are false: a NaN in v would give forces without friction. The patella

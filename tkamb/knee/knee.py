@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pinocchio as pin
 
-from tkamb.errors import ComputationError, InputError, names_near
+from tkamb.errors import ComputationError, InputError, names_near, real_number
 from tkamb.geometry.frames import (
     KNEE_COORDINATES,
     PATELLA_BODY_COORDINATES,
@@ -532,7 +532,7 @@ class Knee(AssembledKnee):
             raise InputError(
                 f"shape {np.shape(load)}", "load", "one q has one load; or give (n, nq)"
             )
-        result, start = self._press_from(q, float(load), data)
+        result, start = self._press_from(q, load, data)
         of_user = contact_of_user(result, self.left)
         return (of_user, self._press_slopes(result, start)) if derivatives else of_user
 
@@ -549,15 +549,14 @@ class Knee(AssembledKnee):
         slopes = press_derivatives(contact.pair, result.pose, probed)
         return replace(slopes, by_pose=mirrored_spatial(slopes.by_pose)) if self.left else slopes
 
-    def _press_from(
-        self, q: Array, load: float, data: KneeData
-    ) -> "tuple[ContactResult, WarmStart]":
+    def _press_from(self, q: Array, load: Any, data: KneeData) -> "tuple[ContactResult, WarmStart]":
         """Return the contact of the equations and its warm start, which `data` stores, too."""
         contact = self._need_contact()
+        load = real_number(load, "press: load", "give a load of 0 or more")
         if not (np.isfinite(load) and load >= 0):
             raise InputError(f"load {load} N", "press", "give a load of 0 or more")
         pose = self._kinematics(data, q).pose
-        result, start = contact.model.press_from(contact.state, float(load), pose, data.start)
+        result, start = contact.model.press_from(contact.state, load, pose, data.start)
         # A failed press has no pressures to start from.
         if not result.failed:
             data.start = start
@@ -588,6 +587,7 @@ class Knee(AssembledKnee):
             raise InputError(
                 "has no patellofemoral contact model", "Knee", "give patellofemoral_contact="
             )
+        force = real_number(force, "press_patella: force", "give a positive force")
         if not (np.isfinite(force) and force > 0):
             raise InputError(f"force {force} N", "press_patella", "give a positive force")
         data = self._data(data, contact=False)

@@ -5,6 +5,7 @@ link. The forces of a unit tension on all links of the line are one column of th
 motion. The moment arm of a line of length L about a coordinate q of the chain is -dL/dq.
 """
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pinocchio as pin
 
-from tkamb.errors import ComputationError, InputError, names_near
+from tkamb.errors import ComputationError, InputError, must_be, names_near, real_number
 from tkamb.geometry.frames import Array, cross, transform
 from tkamb.geometry.polygons import sagittal_outline
 from tkamb.knee.anatomy import Anatomy, FixedFrame
@@ -338,11 +339,13 @@ def tension_lines(muscles: Iterable[Muscle], anatomy: Anatomy) -> dict[str, Tens
     """
     lines = {}
     for muscle in muscles:
+        where = f"muscle {muscle.name}"
+        must_be(muscle.points, (tuple, list), f"{where}: points", "give a list of points on frames")
         points = [link_point(point) for point in muscle.points]
         if len(points) < 2 or muscle.wrap is not None:
             raise InputError(
                 "is not a straight line through two or more points",
-                f"muscle {muscle.name}",
+                where,
                 "give two or more points, and a quadriceps that wraps in extensor=",
             )
         frames = tuple(anatomy.frame(point.link) for point in points)
@@ -371,12 +374,12 @@ def checked_tensions(
                 "the knee has no quadriceps", "tensions", "give extensor=, or muscle -> tension"
             )
         tensions = {extensor[0]: tensions}
-    names = (*extensor, *lines)
+    names, checked = (*extensor, *lines), {}
     for name, tension in tensions.items():
         if name not in names:
             raise InputError(f"no muscle '{name}'", "tensions", names_near(name, list(names)))
-        if not (np.isfinite(tension) and tension >= 0.0):
-            raise InputError(
-                f"tension {tension} N", f"muscle {name}", "a muscle only pulls: give 0 or more"
-            )
-    return {name: float(tension) for name, tension in tensions.items()}
+        hint = "a muscle only pulls: give 0 or more"
+        checked[name] = real_number(tension, f"muscle {name}: tension", hint)
+        if not (math.isfinite(checked[name]) and checked[name] >= 0.0):
+            raise InputError(f"tension {tension} N", f"muscle {name}", hint)
+    return checked

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from tkamb.errors import InputError
+from tkamb.errors import InputError, must_be, real_number
 from tkamb.geometry.frames import Array, inverse, mirrored_pose
 from tkamb.geometry.surface import Surface
 from tkamb.knee.anatomy import Anatomy, FixedFrame
@@ -106,9 +106,11 @@ class Implant:
 
 
 def _as_material(given: "str | Material") -> "Material":
-    from tkamb.contact.materials import material
+    from tkamb.contact.materials import Material, material
 
-    return material(given) if isinstance(given, str) else given
+    made = material(given) if isinstance(given, str) else given
+    must_be(made, Material, "Implant: material", "give its name or a Material")
+    return made
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,7 +263,12 @@ def bundle_on_chain(bridge: Bridge, bundle: "Ligament") -> "Ligament":
         InputError: the slack length is missing, or an end is on a frame outside the knee.
     """
     ends = [bridge.link_point(link_point(end)) for end in (bundle.proximal, bundle.distal)]
-    check_length(bundle.slack_length, "slack_length", f"ligament {bundle.name}")
+    where = f"ligament {bundle.name}"
+    slack = real_number(
+        bundle.slack_length, f"{where}: slack_length", "give slack_length in metres"
+    )
+    check_length(slack, "slack_length", where)
+    must_be(bundle.wraps, (tuple, list), f"{where}: wraps", "give a list of wrap objects")
     wraps = tuple(bridge.wrap_object(wrap) for wrap in bundle.wraps)
     return replace(bundle, proximal=ends[0], distal=ends[1], wraps=wraps)
 
@@ -326,7 +333,7 @@ def prepared_contact(
 
     if isinstance(contact, KneeContact):
         return contact
-    model = _as_model(contact, "contact", cache)
+    model = as_model(contact, "contact", cache)
     assert surfaces.femoral is not None and surfaces.insert is not None
     pair = ContactPair(surfaces.femoral, surfaces.insert, implant.insert_material, implant.bearing)
     return _prepared_pair(model, pair)
@@ -343,7 +350,7 @@ def prepared_button(
     from tkamb.contact.pair import ContactPair
     from tkamb.knee.button import Button, button_in_patella, without_pegs
 
-    model = _as_model(contact, "patellofemoral_contact", cache)
+    model = as_model(contact, "patellofemoral_contact", cache)
     assert surfaces.femoral is not None and surfaces.button is not None
     in_patella = button_in_patella(surfaces.button)
     body = without_pegs(surfaces.button.moved(inverse(in_patella)))
@@ -353,7 +360,7 @@ def prepared_button(
     return Button(_prepared_pair(model, pair), in_patella)
 
 
-def _as_model(contact: "ContactModel | str", where: str, cache: bool) -> "ContactModel":
+def as_model(contact: "ContactModel | str", where: str, cache: bool = True) -> "ContactModel":
     """Return a contact model, from its name if need be; a lattice without its cache if not `cache`.
 
     Raises:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 
-from tkamb.errors import InputError
+from tkamb.errors import InputError, must_be
 from tkamb.geometry.frames import Array, inverse, knee_pose, sagittal_pose
 from tkamb.io.scene import Scene, load_scene
 from tkamb.io.scene.case import Case, load_case
@@ -69,6 +69,7 @@ def read_scene(scene: Scene | Case | str | Path) -> tuple[Knee, Motion, Ground]:
     """
     if isinstance(scene, str | Path):
         scene = load_scene(scene)
+    must_be(scene, (Scene, Case), "read_scene", "give a scene or the path of a scene file")
     case = scene if isinstance(scene, Case) else load_case(scene)
     if case.scene.muscles is not None:  # [muscles] is not part of the knee
         case = replace(case, scene=case.scene.model_copy(update={"muscles": None}))

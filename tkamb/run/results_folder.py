@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tkamb import __version__
-from tkamb.errors import InputError
+from tkamb.errors import InputError, must_be
 from tkamb.files import (
     MEGABYTE,
     Replacement,
@@ -57,6 +57,7 @@ def read_results(directory: str | Path, *, check: bool = True) -> Results:
     Raises:
         InputError: a file is missing, has a wrong format, or has changed since it was written.
     """
+    must_be(directory, (str, os.PathLike), "read_results", "give the folder of a run")
     directory = Path(directory)
     check_replaced(directory)
     if not os.path.exists(directory / CSV_NAME):  # unlike Path.exists, it never raises

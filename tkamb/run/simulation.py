@@ -7,9 +7,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import NoneType
 from typing import TYPE_CHECKING, Any
 
-from tkamb.errors import InputError
+from tkamb.errors import InputError, must_be, real_number
 from tkamb.geometry.frames import Array
 from tkamb.io.claim import claimed_directory
 from tkamb.io.scene import Scene, load_scene, with_overrides, with_preset
@@ -203,6 +204,10 @@ def simulate(
         KeyboardInterrupt: the run was interrupted. The finished frames are in `directory`.
     """
     options = PoolOptions(workers)
+    hint = "give the name of a contact model, or key -> value of [contact]"
+    must_be(contact, (str, Mapping, NoneType), "contact", hint)
+    must_be(overrides, (Mapping, NoneType), "overrides", "give dotted key -> value")
+    must_be(preset, (str, NoneType), "preset", "give its name")
     if isinstance(contact, Mapping):
         tables, contact = {**tables, "contact": contact}, None
     changes = _dotted(overrides or {}, tables)
@@ -382,6 +387,8 @@ def _scene_as(
 
 
 def _case_with_contact(scene: Scene | Case, model: str | None, resolution_mm: float | None) -> Case:
+    if resolution_mm is not None:
+        resolution_mm = real_number(resolution_mm, "resolution_mm", "give it in mm")
     changes = {"model": model, "resolution_mm": resolution_mm}
     changes = {key: value for key, value in changes.items() if value is not None}
     if isinstance(scene, Case):
@@ -402,6 +409,7 @@ def chosen_frames(frames: slice | range | None, count: int) -> range:
     Raises:
         InputError: an end lies outside the motion, or there are no frames.
     """
+    must_be(frames, (slice, range, NoneType), "frames", "give a slice or a range")
     if frames is None:
         return range(count)
     if isinstance(frames, range):

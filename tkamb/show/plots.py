@@ -10,7 +10,7 @@ from matplotlib.ticker import (
     MultipleLocator,
 )
 
-from tkamb.errors import InputError
+from tkamb.errors import InputError, must_be
 from tkamb.run.metrics import failed, flagged
 from tkamb.show.axis import HorizontalAxis, horizontal_axis
 from tkamb.show.panels import Line, Panel, centre_panel, panels
@@ -127,6 +127,9 @@ def plot(results: "Results", *names: str, axis: str | None = None) -> Figure:
     Raises:
         InputError: a plot or the axis does not exist.
     """
+    from tkamb.run.results import Results
+
+    must_be(results, Results, "plot", "give the results of a run")
     by_name = {panel.name: panel for panel in (*panels(results), centre_panel(results))}
     unknown = [name for name in names if name not in by_name]
     if unknown:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Self, get_args
 from pydantic import BaseModel, Field, PrivateAttr, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
-from tkamb.errors import InputError, names_near
+from tkamb.errors import InputError, must_be, names_near
 from tkamb.io.recordings.recording_tables import (
     GroundReactionTable,
     MeasuredTable,
@@ -179,6 +179,7 @@ def load_scene(
         InputError: the file cannot be read, a key is unknown or missing, a value is out of range,
             the preset does not exist, or the scene lacks data for it.
     """
+    must_be(path, (str, os.PathLike), "load_scene", "give the path of a scene file")
     path = Path(path)
     if os.path.isfile(path / "scene.toml"):  # also False for an invalid name, unlike Path.is_file
         raise InputError("is a folder, not a file", path, f"give {path / 'scene.toml'}")

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import shutil
 import tempfile
 from dataclasses import asdict, replace
@@ -10,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from tkamb.errors import InputError, TkambError
+from tkamb.errors import InputError, TkambError, must_be, real_numbers
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import (
     KNEE_COORDINATES,
@@ -306,6 +307,7 @@ def live(
         InputError: the path has no scene, the scene or the knee has no contact model, or an
             argument belongs to the other kind of source.
     """
+    must_be(source, (str, os.PathLike, Knee), "live", "give a scene file, a folder or a tkamb.Knee")
     server = _window_of(source, q, load, frame, contact, Path(folder or DEFAULT_FOLDER)).server()
     serve_in_background(server)
     return server
@@ -350,7 +352,10 @@ def bench_of_knee(knee: Knee, q: Any) -> LiveKnee:
     placement = insert_placement(knee.insert)
     data = knee._kinematic_data()
     poses = np.array(
-        [knee._kinematics(data, one).pose for one in np.atleast_2d(np.asarray(q, float))]
+        [
+            knee._kinematics(data, one).pose
+            for one in np.atleast_2d(real_numbers(q, "live: q", "give (nq,) or (f, nq)"))
+        ]
     )
     coordinates = knee_coordinates(placement @ poses)
     session = Path(tempfile.mkdtemp(prefix="tkamb-live-"))

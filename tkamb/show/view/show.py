@@ -10,7 +10,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tkamb.errors import InputError
+from tkamb.errors import InputError, must_be
 from tkamb.files import replaced_file, write_text
 from tkamb.show.view import CAMERAS
 from tkamb.show.view.draw import draw
@@ -157,4 +157,7 @@ def show(results: "Results", frame: int = 0) -> Show:
     Raises:
         InputError: the scene is missing, or has changed since the run.
     """
+    from tkamb.run.results import Results
+
+    must_be(results, Results, "view", "give the results of a run")
     return Show([run_of_results(results)], frame=frame)
