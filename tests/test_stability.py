@@ -1,6 +1,7 @@
 """The stability study: its verdicts, its processes, and a sample of its cases."""
 
 import json
+import multiprocessing
 import signal
 import subprocess
 import sys
@@ -114,11 +115,24 @@ def test_an_exception_is_a_verdict():
 
 
 def test_a_hang_is_stopped_and_the_next_case_judged(monkeypatch):
-    """The time limits are zero and 600 s, so that the load of the computer has no effect."""
+    """The limits are processor times, so that the load of the computer has no effect."""
     slow, quick = replace(SMALL, resolution_mm=0.5), replace(SMALL, model="nothing")
-    monkeypatch.setattr(_Judges, "limit", lambda self, case: 0.0 if case is slow else 600.0)
+    monkeypatch.setattr(_Judges, "limit", lambda self, case: 0.1 if case is slow else 600.0)
     verdicts = list(run_stability([slow, quick]))
     assert [v.kind for v in verdicts] == ["hang", "flagged"]
+
+
+def test_a_case_that_only_waits_is_no_hang(monkeypatch):
+    """On a loaded computer a process waits. The limit counts its own computing time alone."""
+    waited = Verdict("a case", "lattice", "converged", "after a wait longer than the limit")
+    monkeypatch.setattr(stability, "judge_safely", lambda *_: time.sleep(0.5) or waited)
+    context = multiprocessing.get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=stability._send_verdict, args=(SMALL, sender, 0.2, 0.2))
+    process.start()
+    sender.close()
+    assert receiver.recv() == waited
+    process.join()
 
 
 def test_a_reference_that_takes_too_long_leaves_a_case_unverified(monkeypatch):

@@ -151,9 +151,6 @@ def _run(options: argparse.Namespace) -> int:
     from tkamb.run.simulation import simulate
     from tkamb.run.status import FAILED
     from tkamb.run.timing import Stages
-    from tkamb.show.axis import horizontal_axis
-    from tkamb.show.headline import cards
-    from tkamb.show.report import report_html
 
     scene = _scene_of(options)
     default = Path("out") / options.scene.resolve().parent.name
@@ -169,6 +166,11 @@ def _run(options: argparse.Namespace) -> int:
             resume=options.resume,
             workers=options.workers,
         )
+        # The frames need no matplotlib. Its import takes 0.3 s.
+        from tkamb.show.axis import horizontal_axis
+        from tkamb.show.headline import cards
+        from tkamb.show.report import report_html
+
         if profile:
             results.summary["profile"] = profile.report(results, options.scene)
         write_results(results, directory, report=lambda run: report_html(run, stages.plots))

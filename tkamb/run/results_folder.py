@@ -27,7 +27,6 @@ from tkamb.files import (
 from tkamb.io.claim import claimed_directory
 from tkamb.run.columns import COLUMNS, FAMILIES, KINDS, belongs
 from tkamb.run.results import Results, csv_rows, read_bands, read_csv
-from tkamb.run.summary_check import check_summary
 
 if TYPE_CHECKING:
     from tkamb.run.maps import ContactMaps
@@ -106,6 +105,8 @@ def read_summary(directory: Path) -> dict[str, Any]:
     summary = read_json(path, SUMMARY_LIMIT, what="summary of a run")
     if not isinstance(summary, dict):
         raise InputError("is not a JSON object", path, "give a folder that `tkamb run` wrote")
+    from tkamb.run.summary_check import check_summary  # its schema takes 0.1 s
+
     check_summary(summary, path)
     return summary
 

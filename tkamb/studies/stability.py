@@ -31,10 +31,10 @@ class StabilitySettings:
     """Limits of the stability study."""
 
     longest_seconds: float = 120.0
-    """s: time limit of a model; a longer case is a hang. Usual cases take
+    """s: processor time limit of a model; a longer case is a hang. Usual cases take
     seconds."""
     longest_reference_seconds: float = 900.0
-    """s: time limit of a reference; a longer case is unverified. The study should
+    """s: processor time limit of a reference; a longer case is unverified. The study should
     end within a day."""
     workers: int = 2
     """Number of processes of the study. A small computer has two cores."""
@@ -85,7 +85,7 @@ def run_stability(
     """Judge all cases and yield their verdicts in the order of the cases.
 
     Args:
-        longest: time limit of a case, s.
+        longest: processor time limit of a case, s. The verdict does not depend on other processes.
         kept: stored verdicts of earlier studies. They are not computed again; new ones are added.
         workers: number of cases that run at the same time.
     """
@@ -153,41 +153,47 @@ class _Judges:
 
     def _judge_in_process(self, case: Case) -> Verdict:
         receiver, sender = self._context.Pipe(duplex=False)
-        process = self._context.Process(target=_send_verdict, args=(case, sender), daemon=True)
+        limits = self.limit(case), STABILITY.longest_reference_seconds
+        process = self._context.Process(
+            target=_send_verdict, args=(case, sender, *limits), daemon=True
+        )
         process.start()
         sender.close()  # otherwise the receiver does not notice that the process has ended
         self._running.add(process)
+        result: Any = None
         try:
-            return self._received(case, receiver)
+            if self._stopped:
+                raise EOFError
+            result = receiver.recv()
+            if result == PRESSED:
+                result = receiver.recv()
+            verdict: Verdict = result
+            return verdict
         except EOFError:
             process.join()
             if self._stopped:
                 raise ComputationError("was stopped", case.label) from None
-            reason = f"the process ended with status {process.exitcode}"
-            return _ended(case, "exception", reason)
+            if process.exitcode != -signal.SIGPROF:
+                reason = f"the process ended with status {process.exitcode}"
+                return _ended(case, "exception", reason)
+            if result == PRESSED:
+                return _ended(case, "unverified", f"no reference in {limits[1]:g} s")
+            return _ended(case, "hang", f"no answer in {limits[0]:g} s")
         finally:
             process.kill()
             process.join()
             self._running.discard(process)
 
-    def _received(self, case: Case, receiver: Connection) -> Verdict:
-        if self._stopped:
-            raise EOFError
-        if not receiver.poll(self.limit(case)):
-            return _ended(case, "hang", f"no answer in {self.limit(case):g} s")
-        result = receiver.recv()
-        if result == PRESSED:
-            if not receiver.poll(STABILITY.longest_reference_seconds):
-                reason = f"no reference in {STABILITY.longest_reference_seconds:g} s"
-                return _ended(case, "unverified", reason)
-            result = receiver.recv()
-        verdict: Verdict = result
-        return verdict
 
+def _send_verdict(case: Case, sender: Connection, longest: float, longest_reference: float) -> None:
+    def pressed() -> None:
+        signal.setitimer(signal.ITIMER_PROF, longest_reference)
+        sender.send(PRESSED)
 
-def _send_verdict(case: Case, sender: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process handles Ctrl-C
-    sender.send(judge_safely(case, lambda: sender.send(PRESSED)))
+    # SIGPROF ends the process after this processor time.
+    signal.setitimer(signal.ITIMER_PROF, longest)
+    sender.send(judge_safely(case, pressed))
 
 
 def _ended(case: Case, kind: str, reason: str) -> Verdict:

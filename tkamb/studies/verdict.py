@@ -17,7 +17,7 @@ A closed form is tested with its formula. Kinds of verdict:
 - unflagged_wrong: a result with status ok and no flag fails a check or differs too much.
 - unverified: the status is ok, but the reference did not converge. Counts as failed.
 - exception: an exception of a class that tkamb does not define.
-- hang: the model exceeds its time limit.
+- hang: the model exceeds its limit of processor time.
 
 Accepted verdicts are stored.
 """
