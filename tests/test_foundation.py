@@ -15,6 +15,7 @@ from tkamb.contact.foundation import (
     OVER_THE_EDGE,
     TOO_DEEP,
     ElasticFoundation,
+    FoundationProbe,
     LinearFoundation,
     layer_pressure,
     layer_slope,
@@ -24,7 +25,7 @@ from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import PRESS, press_by_search, search_load
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactStatus
-from tkamb.contact.samples import meet, sample_surface
+from tkamb.contact.samples import sample_surface
 from tkamb.errors import InputError
 from tkamb.geometry.frames import inverse, knee_pose, knee_twist, pose
 from tkamb.geometry.surface import Surface
@@ -329,13 +330,14 @@ def test_a_guess_saves_evaluations_and_does_not_change_the_result(distance, monk
     state = model.prepare(sphere_on_block(material("polyethylene")))
     alone = model.press(state, 1500.0, lowered(0))
     before = model.press(state, 1500.0, lowered(0, x=-distance))
-    evaluations = []
+    evaluations, sums = [], FoundationProbe.sums
 
-    def counted(samples, *arguments):
-        evaluations.append(len(samples.points))
-        return meet(samples, *arguments)
+    def counted(self, *arguments):
+        result = sums(self, *arguments)
+        evaluations.append(len(self._last[1]))
+        return result
 
-    monkeypatch.setattr(contact_samples, "meet", counted)
+    monkeypatch.setattr(FoundationProbe, "sums", counted)
     result = model.press(state, 1500.0, lowered(0), before)
     assert result.status is ContactStatus.OK
     assert result.residual <= PRESS.load_tolerance
@@ -438,14 +440,15 @@ def test_the_stiffness_is_the_slope_of_the_wrench():
     np.testing.assert_allclose(slope, stiffness, rtol=0, atol=1e-6 * np.abs(stiffness).max())
 
 
-def test_columns_missed_by_the_neighbourhood_are_found_by_the_final_evaluation(monkeypatch):
-    """With a wrong bound the search misses columns."""
+def test_columns_missed_by_the_neighbourhood_are_found_by_the_final_evaluation():
+    """With the gaps of another pose the search misses columns."""
     model = ElasticFoundation(1e-3)
     state = model.prepare(sphere_on_block(material("polyethylene")))
     alone = model.press(state, 1500.0, lowered(0))
     before = model.press(state, 1500.0, lowered(0, x=-12e-3))
-    monkeypatch.setattr(contact_samples, "OBLIQUE", 0.0)
-    result = model.press(state, 1500.0, lowered(0), before)
+    missing = replace(before, pose=alone.pose)
+    assert not model.probe(state).seen(missing).condyles
+    result = model.press(state, 1500.0, lowered(0), missing)
     np.testing.assert_allclose(result.approach, alone.approach, rtol=1e-6)
 
 

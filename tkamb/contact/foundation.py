@@ -1,26 +1,32 @@
 """Elastic foundation: a bed of independent springs under a rigid femoral component."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from tkamb.contact.flags import narrow_flags, unsupported_flags
-from tkamb.contact.materials import Material
+from tkamb.contact.materials import Material, ramberg_osgood_ratio
 from tkamb.contact.model import CondyleWrench, ContactModel, LoadedPoints, ProbedContact
 from tkamb.contact.pressing import PRESS, press_by_search
 from tkamb.contact.result import ContactResult, ContactStatus, Guess, WarmStart, medial_points
 from tkamb.contact.samples import (
     DEEPEST,
+    MAP_POINT,
     NEAR,
+    Body,
+    Columns,
     Meeting,
+    Memory,
     Neighbourhood,
     SampledContact,
     SurfaceSamples,
     meet,
+    meet_nearby,
 )
 from tkamb.geometry.compiled import compiled_as_written
-from tkamb.geometry.frames import SIDES, Array, Mask
+from tkamb.geometry.frames import SIDES, Array, Index, Mask, inverse
 from tkamb.units import MILLIMETRE
 
 Law = Literal["nonlinear", "linear"]
@@ -205,7 +211,7 @@ class LinearFoundation(ElasticFoundation):
 
 
 class _NearColumns:
-    """The reaction of the columns whose gap to the femoral component is less than `NEAR`.
+    """The reaction of the columns near the femoral component.
 
     Attributes:
         within: m, largest evaluated approach that is in range; -inf if there is none.
@@ -213,10 +219,9 @@ class _NearColumns:
     """
 
     def __init__(self, law: Law, state: SampledContact, pose: Array, guess: Guess | None) -> None:
-        self._law, self.state, self.pose = law, state, pose
-        self._reach, self._near, self._around = -np.inf, state.surface, Neighbourhood(state)
+        self.state, self.pose, self._probe = state, pose, FoundationProbe(law, state)
         if guess is not None and guess.points is state.points and not np.isnan(guess.gap).any():
-            self._around.take(guess.pose, guess.gap)
+            self._probe.around.take(guess.pose, guess.gap)
         self.within, self.beyond, self._last = -np.inf, np.inf, 0.0
 
     def reaction(self, approach: float) -> float:
@@ -227,25 +232,11 @@ class _NearColumns:
         """
         if self.within < approach < self.beyond <= self.within + APPROACH_STEP:
             return self._last
-        pair = self.state.pair
-        pose = pair.pose_at_approach(self.pose, approach)
-        if approach > self._reach:
-            samples, meeting = self._around.at(pose)
-            close = meeting.gap < NEAR
-            # This set of columns is used until the femur has moved down by half of NEAR. The other
-            # half is a margin, because gaps along inclined normals may shrink faster.
-            self._near, self._reach = samples.part(close), approach + NEAR / 2
-            meeting = meeting.part(close)
-        else:
-            meeting = meet(self._near, pair.femoral, pose)
-        near = self._near
-        strain = np.maximum(-meeting.gap, 0.0) / np.maximum(near.thickness, LEAST_THICKNESS)
-        if (strain >= DEEPEST).any():
+        strain, sums = self._probe.sums(self.state.pair.pose_at_approach(self.pose, approach))
+        if strain >= DEEPEST:
             self.beyond = min(self.beyond, approach)
             return np.inf
-        pressure = layer_pressure(self._law, pair.material, strain)
-        pressure[grazing(near, meeting)] = 0.0
-        reaction = -float(forces_on_insert(near, meeting, pressure)[:, 1].sum())
+        reaction = -float(sums[:, 5].sum())
         if approach > self.within:
             self.within, self._last = approach, reaction
         return reaction
@@ -319,42 +310,69 @@ class FoundationProbe:
 
     def __init__(self, law: Law, state: SampledContact) -> None:
         self._law, self._state = law, state
-        self._around = Neighbourhood(state)
-        self._last: tuple[Array, SurfaceSamples, Meeting] | None = None
+        self.around = Neighbourhood(state)
+        self._last: tuple[Array, Index, Meeting] | None = None
 
     def at(self, pose: Array) -> ProbedContact:
         """Return the contact at a pose_femoral_in_insert (4, 4), with its stiffness."""
-        pose = np.asarray(pose, float)
-        samples, meeting = self._columns(pose)
-        loaded = meeting.gap < 0
-        return self._of(samples.part(loaded), meeting.part(loaded), pose)
+        strain, sums = self.sums(pose)
+        if not strain < DEEPEST:
+            return ProbedContact({}, known=False)
+        condyles = {
+            side: CondyleWrench(
+                one[4:10], one[1:4], one[10:46].reshape(6, 6), one[46:64].reshape(3, 6)
+            )
+            for side, one in zip(SIDES, sums, strict=True)
+            if one[0] > 0.0
+        }
+        through = not strain and self._state.pair.passed_through(pose) is not None
+        return ProbedContact(condyles, known=not through, tangent=True)
 
     def seen(self, result: ContactResult, start: WarmStart | None = None) -> ProbedContact:
         """Return the contact at the pose of a result, from the columns that it loads; see `at`."""
-        if np.isnan(result.gap).any():
-            return self.at(result.pose)
-        samples = self._state.surface.part(result.gap < 0)
-        return self._of(samples, meet(samples, self._state.pair.femoral, result.pose), result.pose)
+        if not np.isnan(result.gap).any():
+            self.around.take(result.pose, result.gap)
+        return self.at(result.pose)
 
-    def _of(self, samples: SurfaceSamples, meeting: Meeting, pose: Array) -> ProbedContact:
-        if not len(meeting.gap):
-            through = self._state.pair.passed_through(pose) is not None
-            return ProbedContact({}, known=not through, tangent=True)
-        strain = -meeting.gap / np.maximum(samples.thickness, LEAST_THICKNESS)
-        if not (strain < DEEPEST).all():
-            return ProbedContact({}, known=False)
-        force = layer_pressure(self._law, self._state.pair.material, strain) * samples.area
-        rate = self._rate(samples, meeting.gap)
-        edge_on = grazing(samples, meeting)
-        force[edge_on] = rate[edge_on] = 0.0
-        condyles = {}
-        for side, sums in self._sums(samples, meeting, force, rate, pose).items():
-            if sums[0] > 0.0:
-                stiffness, centre = sums[10:46].reshape(6, 6), sums[1:4] / sums[0]
-                # The centre is sum(x F) / sum(F) over the columns.
-                slope = sums[46:64].reshape(3, 6) - np.outer(centre, sums[64:])
-                condyles[side] = CondyleWrench(-sums[4:10], centre, stiffness, slope / sums[0])
-        return ProbedContact(condyles, tangent=True)
+    def sums(self, pose: Array) -> tuple[float, Array]:
+        """Return the largest strain of the near columns, and the sums of both sides (2, `SUMS`)."""
+        pose, sums = np.asarray(pose, float), np.zeros((2, SUMS))
+        state, numbers = self._state, self._numbers
+        split = np.inf if state.pair.split is None else state.pair.split
+        if numbers is None:  # the law is not compiled
+            near, meeting = self._columns(pose)
+            loaded = meeting.gap < 0
+            thickness = np.maximum(state.surface.thickness[near], LEAST_THICKNESS)
+            strain = np.where(loaded, -meeting.gap / thickness, 0.0)
+            deepest = float(strain.max(initial=0.0))
+            if deepest < DEEPEST:
+                pressure, slope = self._pressures(strain)
+                self._add_up(near, meeting, pressure, slope * loaded, pose, sums)
+        else:
+            back, steep = inverse(pose), MAP_POINT.side_start_normal_y
+            area, inputs = state.surface.area, self.around.inputs
+            deepest, near, gap, gradient, patch = _sum_nearby(
+                *inputs, back, steep, area, numbers, split, sums
+            )
+            self._last = pose.copy(), near, Meeting(gap, gradient, patch)
+        return deepest, sums
+
+    @cached_property
+    def _numbers(self) -> Array | None:
+        """The numbers of `_layer`; None for another law of the material."""
+        material = self._state.pair.material
+        numbers = material.ramberg_osgood
+        if self._law == "linear":
+            numbers = (0.0, 1.0, 1.0)
+        if numbers is None:
+            return None
+        linear = float(self._law == "linear")
+        return np.array([linear, material.confined_modulus, material.young_modulus, *numbers])
+
+    def _pressures(self, strain: Array) -> tuple[Array, Array]:
+        """Return the pressures (n,), Pa, at strains of the columns, and their slopes."""
+        material = self._state.pair.material
+        return layer_pressure(self._law, material, strain), layer_slope(self._law, material, strain)
 
     def smoothed(self, pose: Array, contact: ProbedContact) -> ProbedContact:
         """Return the contact with its stiffness averaged over a column's width; see `Probe`.
@@ -364,20 +382,21 @@ class FoundationProbe:
         share of its cell inside the edge of contact; the gap is linear across the cell. This adds
         resolution²/6 to the square of a circular contact's radius.
         """
-        samples, meeting = self._columns(pose)
-        near = (meeting.gap < WIDEST_EDGE) & ~grazing(samples, meeting)
-        samples, meeting = samples.part(near), meeting.part(near)
-        gap, length = meeting.gap, np.linalg.norm(meeting.gradient, axis=1)
-        cosine = np.abs(np.einsum("ij,ij->i", meeting.gradient, samples.normals)) / length
-        change = samples.resolution * np.sqrt(np.maximum(1.0 - cosine**2, 0.0)) / cosine
+        near, meeting = self._columns(pose)
+        surface, sums = self._state.surface, np.zeros((2, SUMS))
+        at_edge = (meeting.gap < WIDEST_EDGE) & (meeting.patch >= 0)
+        near, gap, gradient = near[at_edge], meeting.gap[at_edge], meeting.gradient[at_edge]
+        along = np.einsum("ij,ij->i", gradient, surface.normals[near])
+        cosine = np.abs(along) / np.linalg.norm(gradient, axis=1)
+        change = surface.resolution * np.sqrt(np.maximum(1.0 - cosine**2, 0.0)) / cosine
         edge = np.clip(change, APPROACH_STEP, WIDEST_EDGE)
         share = np.clip(0.5 - gap / edge, 0.0, 1.0)
-        within = replace(meeting, gap=np.minimum(gap, 0.0))
-        strain = -within.gap / np.maximum(samples.thickness, LEAST_THICKNESS)
-        force = layer_pressure(self._law, self._state.pair.material, strain) * samples.area
-        sums = self._sums(samples, within, force, self._rate(samples, within.gap) * share, pose)
+        within = Meeting(np.minimum(gap, 0.0), gradient, meeting.patch[at_edge])
+        thickness = np.maximum(surface.thickness[near], LEAST_THICKNESS)
+        pressure, slope = self._pressures(-within.gap / thickness)
+        self._add_up(near, within, pressure, slope * share, pose, sums)
         condyles = {
-            side: replace(condyle, stiffness=sums[side][10:46].reshape(6, 6))
+            side: replace(condyle, stiffness=sums[SIDES.index(side), 10:46].reshape(6, 6))
             for side, condyle in contact.condyles.items()
         }
         return replace(contact, condyles=condyles)
@@ -393,109 +412,182 @@ class FoundationProbe:
             contact: contact at that pose.
             slopes: whether to return the derivative of the pressures.
         """
-        samples, meeting = self._columns(pose)
-        loaded = (meeting.gap < 0) & ~grazing(samples, meeting)
-        samples, meeting = samples.part(loaded), meeting.part(loaded)
-        strain = -meeting.gap / np.maximum(samples.thickness, LEAST_THICKNESS)
-        pressure = layer_pressure(self._law, self._state.pair.material, strain)
-        medial = medial_points(samples.points, pose, self._state.pair.split)
+        near, meeting = self._columns(pose)
+        surface, state = self._state.surface, self._state
+        cosine = np.einsum("ij,ij->i", surface.normals[near], meeting.gradient)
+        loaded = (meeting.gap < 0) & (cosine <= -LEAST_COSINE)
+        near, met, gap = near[loaded], meeting.gradient[loaded], meeting.gap[loaded]
+        points, normals, thickness, _ = (one[near] for one in surface.columns)
+        thickness = np.maximum(thickness, LEAST_THICKNESS)
+        pressure, rate = self._pressures(-gap / thickness)
+        medial = medial_points(points, pose, state.pair.split)
         if not slopes:
-            return LoadedPoints(pressure, samples.area, medial, None)
-        met, places = meeting.gradient, samples.points + meeting.gap[:, None] * samples.normals
-        rate = self._rate(samples, meeting.gap) / samples.area
-        growth = -rate / np.einsum("ij,ij->i", met, samples.normals)
+            return LoadedPoints(pressure, surface.area[near], medial, None)
+        places, growth = points + gap[:, None] * normals, -rate / thickness / cosine[loaded]
         slope = growth[:, None] * np.hstack([met, np.cross(places, met)])
-        return LoadedPoints(pressure, samples.area, medial, slope)
+        return LoadedPoints(pressure, surface.area[near], medial, slope)
 
-    def _columns(self, pose: Array) -> tuple[SurfaceSamples, Meeting]:
+    def _columns(self, pose: Array) -> tuple[Index, Meeting]:
         if self._last is None or not np.array_equal(self._last[0], pose):
-            self._last = pose.copy(), *self._around.at(pose)
+            self._last = np.array(pose, float), *self.around.at(pose)
         return self._last[1:]
 
-    def _rate(self, samples: SurfaceSamples, gap: Array) -> Array:
-        """Return the derivative (n,), N/m, of the columns' forces by their penetrations."""
-        thickness = np.maximum(samples.thickness, LEAST_THICKNESS)
-        slope = layer_slope(self._law, self._state.pair.material, -gap / thickness)
-        return slope * samples.area / thickness
-
-    def _sums(
+    def _add_up(
         self,
-        samples: SurfaceSamples,
+        near: Index,
         meeting: Meeting,
-        force: Array,
-        rate: Array,
+        pressure: Array,
+        slope: Array,
         pose: Array,
-    ) -> dict[str, Array]:
-        """Return the sums (`SUMS`,) over the columns of each side, see `_add_up`."""
-        medial = medial_points(samples.points, pose, self._state.pair.split)
-        sums = np.zeros((2, SUMS))
-        columns = samples.points, samples.normals
-        met = meeting.gradient, meeting.curvature, meeting.gap
-        _add_up(*columns, *met, force, rate, medial, sums)
-        return dict(zip(SIDES, sums, strict=True))
+        sums: Array,
+    ) -> None:
+        state = self._state
+        split = np.inf if state.pair.split is None else state.pair.split
+        curvatures = state.pair.femoral.curved.quadratics[-1]
+        columns, back = (near, state.surface.columns, state.surface.area), inverse(pose)
+        met = meeting.gap, meeting.gradient, meeting.patch
+        _add_up(*columns, *met, curvatures, pressure, slope, back, split, sums)
+
+
+@compiled_as_written
+def _sum_nearby(
+    columns: Columns,
+    body: Body,
+    memory: Memory,
+    back: Array,
+    steep: float,
+    area: Array,
+    numbers: Array,
+    split: float,
+    sums: Array,
+) -> tuple[float, Index, Array, Array, Index]:
+    """Return the largest strain, and the results of `meet_nearby`; write the sums of `_add_up`.
+
+    The first arguments are those of `meet_nearby`, the other ones those of `_add_up` and `_layer`.
+    """
+    near, gap, gradient, patch = meet_nearby(columns, body, memory, back, steep)
+    pressure, slope, deepest = np.zeros(len(near)), np.zeros(len(near)), 0.0
+    for n in range(len(near)):
+        if gap[n] < 0.0:
+            strain = -gap[n] / max(columns[2][near[n]], LEAST_THICKNESS)
+            deepest = max(deepest, strain)
+            pressure[n], slope[n] = _layer(strain, numbers)
+    _add_up(
+        near, columns, area, gap, gradient, patch, body[2][4], pressure, slope, back, split, sums
+    )
+    return deepest, near, gap, gradient, patch
+
+
+@compiled_as_written
+def _layer(strain: float, numbers: Array) -> tuple[float, float]:
+    """Return the results of `layer_pressure` and `layer_slope` at a strain in (0, 1).
+
+    Args:
+        numbers: (6,) one for the linear law, else zero; M and E, Pa; alpha, sigma0 (Pa) and n of
+            `RambergOsgood`, with alpha = 0 for a linear material.
+    """
+    linear, confined, young, alpha, reference, exponent = numbers
+    if linear:
+        return confined * strain, confined
+    stiffening = confined / young
+    elastic = stiffening * -np.log1p(-strain) * (young / reference)
+    ratio = elastic if alpha == 0.0 else ramberg_osgood_ratio(elastic, alpha, exponent)
+    tangent = young / (1.0 + alpha * exponent * ratio ** (exponent - 1.0))
+    return reference * ratio, tangent * stiffening / (1.0 - strain)
 
 
 @compiled_as_written
 def _add_up(
-    points: Array,
-    normals: Array,
-    gradients: Array,
-    curvatures: Array,
+    chosen: Index,
+    columns: Columns,
+    area: Array,
     gap: Array,
-    force: Array,
-    rate: Array,
-    medial: Mask,
+    gradients: Array,
+    patches: Index,
+    curvatures: Array,
+    pressure: Array,
+    slope: Array,
+    back: Array,
+    split: float,
     sums: Array,
 ) -> None:
     """Sum the columns' forces, and their change as the femoral component moves.
 
     Args:
-        points: (n, 3) m, start of the columns on the insert.
-        normals: (n, 3) unit normals of the insert at these points.
-        gradients: (n, 3) normals of the femoral surface where the columns meet it, of any length.
-        curvatures: (n, 3, 3) 1/m, minus the derivative of `gradients` by the place on the femur.
-        gap: (n,) m.
-        force: (n,) N, pressure times area of each column.
-        rate: (n,) N/m, derivative of `force` by the penetration along the insert's normal.
-        medial: (n,) whether a column belongs to the medial condyle.
-        sums: (2, `SUMS`) output for medial and lateral, to which the columns are added: force (N),
-            force times point (3,) N·m, wrench on the femoral component (6,), stiffness of the
-            wrench on the insert (6, 6), and of force times point (3, 6) and force (6,), by a
-            displacement. Force is the magnitude of a column's force.
+        chosen: (m,) numbers of the columns.
+        columns: see `Columns`.
+        area: (n,) m², area of each column.
+        gap: (m,) m.
+        gradients: (m, 3) normals of the femoral surface where the columns meet it, of any length.
+        patches: (m,) patches of the femoral surface.
+        curvatures: (k, 3, 3) 1/m, of the patches: minus the derivative of `gradients` by the place
+            on the femur, femoral frame.
+        pressure: (m,) Pa, of each column.
+        slope: (m,) Pa, derivative of `pressure` by the strain.
+        back: (4, 4) pose_insert_in_femoral.
+        split: m, see `medial_points`.
+        sums: (2, `SUMS`) output for medial and lateral: force (N), centre (3,), m, wrench (6,) on
+            the insert, its stiffness (6, 6), derivatives of the centre (3, 6) and of the force (6,)
+            by a displacement. Force is the sum of the magnitudes of the columns' forces.
     """
+    points, normals, thickness, _ = columns
     met, place, change = np.empty(6), np.empty(3), np.empty((6, 6))
-    for n in range(len(points)):
-        if force[n] == 0.0 and rate[n] == 0.0:
+    half, curvature = np.empty((3, 3)), np.empty((3, 3))
+    for n in range(len(chosen)):
+        column, cosine = chosen[n], 0.0
+        for i in range(3):
+            cosine += gradients[n, i] * normals[column, i]
+        idle = pressure[n] == 0.0 and slope[n] == 0.0
+        if idle or cosine > -LEAST_COSINE:  # a column that meets the femur edge on has no load
             continue
-        side_sums, cosine, length = sums[0 if medial[n] else 1], 0.0, 0.0
+        length, across = 0.0, back[2, 3]
         for i in range(3):
             met[i] = gradients[n, i]
-            cosine += met[i] * normals[n, i]
             length += met[i] ** 2
-            place[i] = points[n, i] + gap[n] * normals[n, i]
+            across += back[2, i] * points[column, i]
+            place[i] = points[column, i] + gap[n] * normals[column, i]
+        side_sums = sums[0 if across < split else 1]
         for i in range(3):
             j, k = (i + 1) % 3, (i + 2) % 3
             met[3 + i] = place[j] * met[k] - place[k] * met[j]
-        size = -force[n] / cosine
+            for m in range(3):
+                half[i, m] = 0.0
+                for q in range(3):
+                    half[i, m] += curvatures[patches[n], i, q] * back[q, m]
+        for i in range(3):
+            for m in range(3):
+                curvature[i, m] = 0.0
+                for q in range(3):
+                    curvature[i, m] += back[q, i] * half[q, m]
+        size = -pressure[n] * area[column] / cosine
+        rate = slope[n] * area[column] / max(thickness[column], LEAST_THICKNESS)
         weight = size * np.sqrt(length)
         side_sums[0] += weight
         for i in range(3):
-            side_sums[1 + i] += weight * points[n, i]
-        _turn(normals[n], curvatures[n], place, met, cosine, change)
+            side_sums[1 + i] += weight * points[column, i]
+        _turn(normals[column], curvature, place, met, cosine, change)
         for i in range(6):
-            side_sums[4 + i] -= size * met[i]
+            side_sums[4 + i] += size * met[i]
         for j in range(6):
             turned, stretched = 0.0, 0.0  # n . dm, m . dm
             for k in range(3):
-                turned += normals[n, k] * change[k, j]
+                turned += normals[column, k] * change[k, j]
                 stretched += met[k] * change[k, j]
-            resized = met[j] * (rate[n] / cosine**2) - size * turned / cosine
+            resized = met[j] * (rate / cosine**2) - size * turned / cosine
             for i in range(6):
                 side_sums[10 + 6 * i + j] += resized * met[i] + size * change[i, j]
             reweighed = (resized * length + size * stretched) / np.sqrt(length)
             side_sums[64 + j] += reweighed
             for i in range(3):
-                side_sums[46 + 6 * i + j] += reweighed * points[n, i]
+                side_sums[46 + 6 * i + j] += reweighed * points[column, i]
+    for side_sums in sums:
+        if side_sums[0] > 0.0:
+            # The centre is sum(x F) / sum(F) over the columns.
+            for i in range(3):
+                side_sums[1 + i] /= side_sums[0]
+                for j in range(6):
+                    slope_of_sum = side_sums[46 + 6 * i + j] - side_sums[1 + i] * side_sums[64 + j]
+                    side_sums[46 + 6 * i + j] = slope_of_sum / side_sums[0]
 
 
 @compiled_as_written

@@ -5,6 +5,8 @@ columns that the femoral component cannot reach.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -12,9 +14,11 @@ from scipy.spatial import cKDTree
 from tkamb.contact.pair import ContactSurface, PreparedContact
 from tkamb.errors import InputError
 from tkamb.geometry.compiled import compiled_as_written
-from tkamb.geometry.frames import Array, Index, Mask, inverse, rotate, transform
-from tkamb.geometry.rays import RayCaster
+from tkamb.geometry.curved import crossed_patch
+from tkamb.geometry.frames import Array, Index, Mask, inverse, transform
+from tkamb.geometry.rays import THREADED_RAYS, RayCaster, first_crossing, ray_work
 from tkamb.geometry.surface import Surface
+from tkamb.geometry.threads import in_halves
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,14 @@ class MapPointSettings:
 
 MAP_POINT = MapPointSettings()
 
+Columns = tuple[Array, Array, Array, Array]
+"""Points (n, 3), m, normals (n, 3), thicknesses (n,) and depths (n,), m, of `SurfaceSamples`."""
+Body = tuple[Any, Array, Any]
+"""`RayCaster.tree`, face normals (k, 3) and `CurvedSurface.quadratics` of the femoral component."""
+Memory = tuple[Array, Array, Index]
+"""What a `Neighbourhood` knows of each column since its last evaluation: gap (n,), m, up to
+`FARTHEST`; position (n, 3), m, femoral frame; place (n,) of the triangle in the tree, or -1."""
+
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSamples(ContactSurface):
@@ -61,17 +73,10 @@ class SurfaceSamples(ContactSurface):
     depth: Array
     resolution: float
 
-    def part(self, chosen: Mask | Index) -> "SurfaceSamples":
-        """Return the chosen points, by mask or index, without triangles."""
-        return SurfaceSamples(
-            self.points[chosen],
-            self.normals[chosen],
-            self.area[chosen],
-            self.thickness[chosen],
-            np.empty((0, 3), np.int64),
-            self.depth[chosen],
-            self.resolution,
-        )
+    @cached_property
+    def columns(self) -> "Columns":
+        """The arrays for the compiled loops."""
+        return self.points, self.normals, self.thickness, self.depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,83 +135,107 @@ class Meeting:
         gap: (n,) m, along the insert's normals, see `gaps_along_normals`.
         gradient: (n, 3) outward normals of the femoral surface, insert frame; their length is
             about 1, and 0 where a column meets nothing.
-        curvature: (n, 3, 3) 1/m, minus the derivative of `gradient` by the place on the femur.
+        patch: (n,) patches of the femoral surface (`CurvedSurface.quadratics`); -1 for none.
     """
 
     gap: Array
     gradient: Array
-    curvature: Array
-
-    def part(self, chosen: Mask | Index) -> "Meeting":
-        """Return the chosen points, by mask or index."""
-        return Meeting(self.gap[chosen], self.gradient[chosen], self.curvature[chosen])
+    patch: Index
 
 
 def meet(samples: SurfaceSamples, femoral: Surface, pose: Array) -> Meeting:
     """Return where columns meet the smooth surface that the femoral mesh approximates."""
-    back = inverse(pose)
-    gap, face = _gaps(samples, femoral, back)
-    origins, directions = transform(back, samples.points), rotate(back, samples.normals)
-    gradient, curvature = femoral.curved.cross(face, origins, directions, gap)
-    turn = np.asarray(pose)[:3, :3]
-    return Meeting(gap, rotate(pose, gradient), turn @ curvature @ turn.T)
+    back, body, count = inverse(pose), body_of(femoral), len(samples.points)
+    gap, gradient, patch = np.empty(count), np.empty((count, 3)), np.empty(count, np.int64)
+    chosen, places = np.arange(count), np.full(count, -1)
+
+    def part(half: slice) -> None:
+        found = gap[half], gradient[half], patch[half]
+        steep = MAP_POINT.side_start_normal_y
+        meet_columns(chosen[half], samples.columns, body, back, steep, places, *found)
+
+    if count < THREADED_RAYS:
+        part(slice(0, count))
+    else:
+        in_halves(part, count)
+    return Meeting(gap, gradient, patch)
 
 
-def _gaps(samples: SurfaceSamples, femoral: Surface, back: Array) -> tuple[Array, Index]:
-    """Return the gap (n,), m, and the femoral facet (n,), for the insert's pose in the femur."""
-    columns = samples.points, samples.normals, samples.thickness, samples.depth
-    origins, normals, below = _columns(*columns, back)
-    gap, face = _first_entry(femoral, origins, normals)
-    # Rays start inside the insert, so that they meet a penetrating femur from outside.
-    gap -= below
-    # On a steep wall a column may start inside the femur, beside its point. If the point is outside
-    # the femur, the gap above the point counts.
-    steep = np.flatnonzero((gap < 0) & (samples.normals[:, 1] < MAP_POINT.side_start_normal_y))
-    if len(steep):
-        rim = origins[steep] + below[steep, None] * normals[steep]
-        above, rim_face = _first_entry(femoral, rim, normals[steep])
-        free = above > 0
-        gap[steep[free]], face[steep[free]] = above[free], rim_face[free]
-    return gap, face
+def body_of(femoral: Surface) -> Body:
+    """Return the arrays of the femoral component for the compiled loops."""
+    return femoral.rays.tree, femoral.face_normals, femoral.curved.quadratics
 
 
 @compiled_as_written
-def _columns(
-    points: Array, normals: Array, thickness: Array, depth: Array, back: Array
-) -> tuple[Array, Array, Array]:
-    """Return start and direction of the columns' rays (n, 3), femoral frame, and depth (n,), m."""
-    origins, along = np.empty((len(points), 3)), np.empty((len(points), 3))
-    below = np.empty(len(points))
-    for n in range(len(points)):
-        below[n] = DEEPEST * min(thickness[n], depth[n])
+def meet_columns(
+    chosen: Index,
+    columns: Columns,
+    body: Body,
+    back: Array,
+    steep: float,
+    places: Index,
+    gap: Array,
+    gradient: Array,
+    patch: Index,
+) -> None:
+    """Write where the chosen columns (m,) meet the femoral surface.
+
+    Args:
+        back: (4, 4) pose_insert_in_femoral.
+        steep: `MapPointSettings.side_start_normal_y`.
+        places: (n,) place in the tree of the triangle that each ray may meet, or -1; updated.
+        gap: (m,) output, see `Meeting`.
+        gradient: (m, 3) output.
+        patch: (m,) output.
+    """
+    points, normals, thickness, depth = columns
+    tree, face_normals, quadratics = body
+    work, point, along = ray_work(), np.empty(3), np.empty(3)
+    start, normal = np.empty(3), np.empty(3)
+    for n in range(len(chosen)):
+        column = chosen[n]
+        # Rays start inside the insert, so that they meet a penetrating femur from outside.
+        below = DEEPEST * min(thickness[column], depth[column])
         for i in range(3):
-            start, component = back[i, 3], 0.0
+            point[i], along[i] = back[i, 3], 0.0
             for k in range(3):
-                start += back[i, k] * points[n, k]
-                component += back[i, k] * normals[n, k]
-            along[n, i], origins[n, i] = component, start - below[n] * component
-    return origins, along, below
-
-
-def _first_entry(femoral: Surface, origins: Array, directions: Array) -> tuple[Array, Index]:
-    """Return the distance (n,), m, to the femur along rays, -inf from inside it, and the facet."""
-    distance, face = femoral.rays.first(origins, directions)
-    _mark_within(distance, face, directions, femoral.face_normals)
-    return distance, face
+                point[i] += back[i, k] * points[column, k]
+                along[i] += back[i, k] * normals[column, k]
+            start[i] = point[i] - below * along[i]
+        distance, place = first_crossing(tree, start, along, places[column], work)
+        places[column] = place
+        distance = _from_outside(distance, tree[1][place], along, face_normals) - below
+        # On a steep wall a column may start inside the femur, beside its point. If the point is
+        # outside the femur, the gap above the point counts.
+        if distance < 0.0 and normals[column, 1] < steep:
+            for i in range(3):
+                start[i] += below * along[i]
+            above, above_place = first_crossing(tree, start, along, -1, work)
+            above = _from_outside(above, tree[1][above_place], along, face_normals)
+            if above > 0.0:
+                distance, place = above, above_place
+        gap[n], patch[n] = distance, -1
+        gradient[n, 0], gradient[n, 1], gradient[n, 2] = 0.0, 0.0, 0.0
+        if np.isfinite(distance):
+            patch[n] = quadratics[0][tree[1][place]]
+            gap[n] = crossed_patch(quadratics, patch[n], point, along, distance, normal)
+            for i in range(3):
+                for k in range(3):
+                    gradient[n, i] += back[k, i] * normal[k]
 
 
 @compiled_as_written
-def _mark_within(distance: Array, face: Index, directions: Array, normals: Array) -> None:
-    """Write -inf for each ray that leaves the femur through the first facet that it meets."""
-    for n in range(len(face)):
-        if face[n] >= 0:
-            facing = 0.0
-            for k in range(3):
-                facing += directions[n, k] * normals[face[n], k]
-            # A ray that leaves the femur at its first crossing starts inside the femur: the
-            # penetration is deeper than the start of the column.
-            if facing > 0.0:
-                distance[n] = -np.inf
+def _from_outside(distance: float, face: int, along: Array, face_normals: Array) -> float:
+    """Return the distance (m) to the femur along a ray; -inf if the ray leaves it first.
+
+    A ray that leaves the femur at its first crossing starts inside the femur: the penetration is
+    deeper than the start of the column.
+    """
+    facing = 0.0
+    if distance < np.inf:
+        for k in range(3):
+            facing += along[k] * face_normals[face, k]
+    return -np.inf if facing > 0.0 else distance
 
 
 def _grid(insert: Surface, resolution: float) -> tuple[Array, tuple[int, int]]:
@@ -343,61 +372,60 @@ class Neighbourhood:
 
     Args:
         state: state that the model's `prepare` returned.
+
+    Attributes:
+        inputs: the first three arguments of `meet_nearby`.
     """
 
     def __init__(self, state: SampledContact) -> None:
-        self._bed, self._femoral = state.surface, state.pair.femoral
-        self._gap = np.full(len(self._bed.points), -np.inf)
-        self._last_position = np.zeros_like(self._bed.points)
-        """(n, 3) m, femoral frame, positions of the columns at their last evaluation."""
+        self._bed, count = state.surface, len(state.surface.points)
+        self._gap, self._last_position = np.full(count, -np.inf), np.zeros((count, 3))
+        memory = self._gap, self._last_position, np.full(count, -1)
+        self.inputs = state.surface.columns, body_of(state.pair.femoral), memory
 
     def take(self, pose: Array, gap: Array) -> None:
         """Store the gaps (n,) of all columns at a pose (4, 4)."""
-        self._gap, self._last_position = np.minimum(gap, FARTHEST), self._places(pose)
+        np.minimum(gap, FARTHEST, out=self._gap)
+        self._last_position[:] = transform(inverse(pose), self._bed.points)
 
-    def at(self, pose: Array) -> tuple[SurfaceSamples, Meeting]:
+    def at(self, pose: Array) -> tuple[Index, Meeting]:
         """Return the near columns at a pose (4, 4), and where they meet the femoral surface."""
-        near, places = np.empty(len(self._gap), np.int64), np.empty_like(self._last_position)
-        number = _near(
-            self._bed.points, inverse(pose), self._last_position, self._gap, near, places
-        )
-        near = near[:number]
-        columns = self._bed.part(near)
-        meeting = meet(columns, self._femoral, pose)
-        self._gap[near] = np.minimum(meeting.gap, FARTHEST)
-        self._last_position[near] = places[:number]
-        return columns, meeting
-
-    def _places(self, pose: Array) -> Array:
-        return transform(inverse(pose), self._bed.points)
+        steep = MAP_POINT.side_start_normal_y
+        near, gap, gradient, patch = meet_nearby(*self.inputs, inverse(pose), steep)
+        return near, Meeting(gap, gradient, patch)
 
 
 @compiled_as_written
-def _near(
-    points: Array, pose: Array, last_position: Array, gap: Array, near: Index, places: Array
-) -> int:
-    """Write the columns that the femoral component may reach, and return their count.
+def meet_nearby(
+    columns: Columns, body: Body, memory: Memory, back: Array, steep: float
+) -> tuple[Index, Array, Array, Index]:
+    """Return the columns (m,) that the femoral component may reach, and the fields of `Meeting`.
 
     Args:
-        points: (n, 3) m, starts of all columns, insert frame.
-        pose: (4, 4) pose_insert_in_femoral.
-        last_position: (n, 3) m, femoral frame, positions at the last evaluation of each column.
-        gap: (n,) m, gap at the last evaluation.
-        near: (n,) output, numbers of the columns that may be reached.
-        places: (n, 3) m, output, positions of these columns in the femoral frame.
+        memory: what is known of all columns; updated.
+        back: (4, 4) pose_insert_in_femoral.
+        steep: `MapPointSettings.side_start_normal_y`.
     """
-    number = 0
+    points, (last_gap, last_position, places) = columns[0], memory
+    near, number, place = np.empty(len(points), np.int64), 0, np.empty(3)
     for n in range(len(points)):
         square = 0.0
         for i in range(3):
-            places[number, i] = pose[i, 3]
+            place[i] = back[i, 3]
             for j in range(3):
-                places[number, i] += pose[i, j] * points[n, j]
-            square += (places[number, i] - last_position[n, i]) ** 2
-        if gap[n] - OBLIQUE * np.sqrt(square) < NEAR:
+                place[i] += back[i, j] * points[n, j]
+            square += (place[i] - last_position[n, i]) ** 2
+        if last_gap[n] - OBLIQUE * np.sqrt(square) < NEAR:
             near[number] = n
             number += 1
-    return number
+            for i in range(3):
+                last_position[n, i] = place[i]
+    near = near[:number]
+    gap, gradient, patch = np.empty(number), np.empty((number, 3)), np.empty(number, np.int64)
+    meet_columns(near, columns, body, back, steep, places, gap, gradient, patch)
+    for n in range(number):
+        last_gap[near[n]] = min(gap[n], FARTHEST)
+    return near, gap, gradient, patch
 
 
 DOWN = np.array([0.0, -1.0, 0.0])

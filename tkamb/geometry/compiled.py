@@ -1,14 +1,18 @@
 """Decorators for loops that numba compiles at the first call and stores on disk.
 
 The import takes 0.1 to 0.4 s. The compiled code is stored beside the module, or in the user's cache
-(`NUMBA_CACHE_DIR`) if that folder cannot be written. Indices are not checked against bounds. A
-compiled function uses no name of another file, because numba's cache does not detect changes of
-other files.
+(`NUMBA_CACHE_DIR`) if that folder cannot be written. Indices are not checked against bounds.
+
+Numba's cache detects changes of a function's own file only. A compiled function may call compiled
+functions of other files, because its stored name contains a hash of these files. It uses no other
+name of another file.
 """
 
+import hashlib
 import logging
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from numba import njit
@@ -38,10 +42,21 @@ def _compiled(function: Function, fastmath: set[str], **more: str) -> Function:
     options: dict[str, Any] = {"nogil": True, "fastmath": fastmath or False, **more}
     compiler: Any = njit
     try:
+        _name_by_files(function)
         return cast(Function, compiler(cache=True, **options)(function))
-    except RuntimeError:  # numba has no folder for its cache
+    except (RuntimeError, OSError):  # numba has no folder for its cache, or a file is missing
         _say_once()
         return cast(Function, compiler(**options)(function))
+
+
+def _name_by_files(function: Any) -> None:
+    """Add a hash of the other files of called functions to the name of the stored code."""
+    own, values = {function.__code__.co_filename}, function.__globals__
+    called = [getattr(values.get(name), "py_func", None) for name in function.__code__.co_names]
+    function.files = own.union(*(getattr(one, "files", ()) for one in called))
+    if others := function.files - own:
+        text = b"".join(Path(file).read_bytes() for file in sorted(others))
+        function.__qualname__ += f"_{hashlib.sha256(text).hexdigest()[:16]}"
 
 
 @cache

@@ -88,10 +88,11 @@ class CurvedSurface:
         return float(self.sagittas.max(initial=0.0))
 
     @cached_property
-    def _quadratics(self) -> tuple[Array, Array, Array, Array]:
+    def quadratics(self) -> tuple[Index, Array, Array, Array, Array]:
         """The heights over the triangles as h = a.o + o.H o/2, with o the offset from corner 1.
 
-        First corners (k, 3), m; unit normals (k, 3); a (k, 3); H (k, 3, 3), 1/m.
+        Patch (m,) of each triangle, of the finer surface if there is one; first corners (k, 3), m;
+        unit normals (k, 3); a (k, 3); H (k, 3, 3), 1/m.
         """
         rows = np.nan_to_num(self.surface.barycentric_rows)  # a degenerate triangle stays flat
         slopes = 4.0 * (
@@ -101,75 +102,58 @@ class CurvedSurface:
         products = np.einsum("kai,kbj->kabij", gradients, gradients)
         half = np.einsum("ka,kaij->kij", 4.0 * self.sagittas, products[:, [1, 2, 0], [2, 0, 1]])
         curvatures = half + half.transpose(0, 2, 1)
-        return self.surface.triangles[:, 0], self.surface.face_normals, slopes, curvatures
-
-    def cross(
-        self, faces: Index, origins: Array, directions: Array, distances: Array
-    ) -> tuple[Array, Array]:
-        """Move the crossings of rays from triangles to their patches, which is exact.
-
-        The height above the patches has the gradient q and minus the second derivative H. Both are
-        those of the surface that the ray meets, so that the distance t of a point that moves by u
-        changes by (q . u)/(q . direction).
-
-        Args:
-            faces: (n,) triangles, of the finer surface if there is one; -1 for no triangle.
-            origins: (n, 3) m, starts of the rays.
-            directions: (n, 3) unit vectors.
-            distances: (n,) m, to the triangles; changed in place to the distances to the patches.
-                Those that are not finite stay. A ray that passes its patch keeps its distance.
-
-        Returns:
-            q (n, 3), outward, of a length of about 1; H (n, 3, 3), 1/m; zero without a crossing.
-        """
-        if self.finer is not None:
-            faces = np.where(faces < 0, faces, self.finer.parent[faces])
-        gradients, curvatures = np.zeros_like(origins), np.zeros((len(origins), 3, 3))
-        _cross(*self._quadratics, faces, origins, directions, distances, gradients, curvatures)
-        return gradients, curvatures
+        faces = np.arange(len(slopes)) if self.finer is None else self.finer.parent
+        corners, normals = self.surface.triangles[:, 0], self.surface.face_normals
+        heights = (np.ascontiguousarray(one) for one in (corners, normals, slopes, curvatures))
+        return np.ascontiguousarray(faces), *heights  # type: ignore[return-value]
 
 
 @compiled_as_written
-def _cross(
-    corners: Array,
-    normals: Array,
-    slopes: Array,
-    curvatures: Array,
-    faces: Index,
-    origins: Array,
-    directions: Array,
-    distances: Array,
-    gradients: Array,
-    turns: Array,
-) -> None:
-    """Solve a quadratic for each ray; see `CurvedSurface.cross`."""
-    offset = np.empty(3)
-    for n in range(len(faces)):
-        face = faces[n]
-        if face < 0 or not np.isfinite(distances[n]):
-            continue
-        constant, linear, square = 0.0, 0.0, 0.0
-        for i in range(3):
-            offset[i] = origins[n, i] + distances[n] * directions[n, i] - corners[face, i]
-        for i in range(3):
-            bend, bent = 0.0, 0.0
-            for j in range(3):
-                turns[n, i, j] = curvatures[face, i, j]
-                bend += curvatures[face, i, j] * offset[j]
-                bent += curvatures[face, i, j] * directions[n, j]
-            gradients[n, i] = normals[face, i] - slopes[face, i] - bend
-            # The height above the patch is constant + linear t + square t² along the ray.
-            constant += (normals[face, i] - slopes[face, i] - 0.5 * bend) * offset[i]
-            linear += gradients[n, i] * directions[n, i]
-            square -= 0.5 * directions[n, i] * bent
-        root = linear * linear - 4.0 * square * constant
-        if root <= 0.0 or linear == 0.0:
-            continue
-        travel = -2.0 * constant / (linear + np.copysign(np.sqrt(root), linear))
-        distances[n] += travel
-        for i in range(3):
-            for j in range(3):
-                gradients[n, i] -= curvatures[face, i, j] * travel * directions[n, j]
+def crossed_patch(
+    quadratics: tuple[Index, Array, Array, Array, Array],
+    patch: int,
+    origin: Array,
+    direction: Array,
+    distance: float,
+    gradient: Array,
+) -> float:
+    """Return the distance (m) of a ray's crossing with a patch, which is exact.
+
+    The height above the patch has the gradient q and minus the second derivative H
+    (`CurvedSurface.quadratics`). Both are those of the surface that the ray meets, so that the
+    distance of a point that moves by u changes by (q . u)/(q . direction). A ray that passes its
+    patch keeps its distance.
+
+    Args:
+        quadratics: `CurvedSurface.quadratics`.
+        patch: number of the patch.
+        origin: (3,) m, start of the ray.
+        direction: (3,) unit vector.
+        distance: m, to the triangle.
+        gradient: (3,) output, q, outward, of a length of about 1.
+    """
+    _, corners, normals, slopes, curvatures = quadratics
+    constant, linear, square = 0.0, 0.0, 0.0
+    for i in range(3):
+        bend, bent = 0.0, 0.0
+        for j in range(3):
+            offset = origin[j] + distance * direction[j] - corners[patch, j]
+            bend += curvatures[patch, i, j] * offset
+            bent += curvatures[patch, i, j] * direction[j]
+        offset = origin[i] + distance * direction[i] - corners[patch, i]
+        gradient[i] = normals[patch, i] - slopes[patch, i] - bend
+        # The height above the patch is constant + linear t + square t² along the ray.
+        constant += (normals[patch, i] - slopes[patch, i] - 0.5 * bend) * offset
+        linear += gradient[i] * direction[i]
+        square -= 0.5 * direction[i] * bent
+    root = linear * linear - 4.0 * square * constant
+    if root <= 0.0 or linear == 0.0:
+        return distance
+    travel = -2.0 * constant / (linear + np.copysign(np.sqrt(root), linear))
+    for i in range(3):
+        for j in range(3):
+            gradient[i] -= curvatures[patch, i, j] * travel * direction[j]
+    return distance + travel
 
 
 @compiled_as_written

@@ -52,6 +52,11 @@ class RayCaster:
     Args:
         surface: the surface; rays are given in its frame.
         tree: tree of the surface; None: it is built.
+
+    Attributes:
+        tree: boxes (2 p, 6), m, and triangles (p c,) of the leaves, see `TriangleTree`; planes
+            (p c, 12) of these triangles, see `_crossing`; distance (m) before the origin from which
+            a crossing counts.
     """
 
     def __init__(self, surface: "Surface", tree: TriangleTree | None = None) -> None:
@@ -61,7 +66,7 @@ class RayCaster:
         self._same = SAME_CROSSING * float(np.linalg.norm(upper - lower)) / 2.0
         rows = surface.barycentric_rows.reshape(-1, 6)
         planes = np.hstack([surface.triangles[:, 0], surface.face_normals, rows])
-        self._tree = tree.boxes, tree.faces, planes[tree.faces]
+        self.tree = tree.boxes, tree.faces, planes[tree.faces], self._same
 
     def first(self, origins: ArrayLike, directions: ArrayLike) -> tuple[Array, Index]:
         """Return the nearest crossing of each ray at or beyond its origin.
@@ -132,7 +137,7 @@ class RayCaster:
 
         def crossings(part: slice) -> tuple[Array, Index, Array]:
             along = directions[part] if len(directions) > 1 else directions
-            return _first_crossings(*self._tree, origins[part], along, -self._same, EDGE_TOLERANCE)
+            return _first_crossings(self.tree, origins[part], along)
 
         if len(origins) < THREADED_RAYS:
             return crossings(slice(0, len(origins)))
@@ -159,9 +164,7 @@ class RayCaster:
         while number > capacity:
             capacity = number
             ray, distance, face = (np.empty(capacity, kind) for kind in (np.int64, float, np.int64))
-            number = _all_crossings(
-                *self._tree, *rays, -self._same, EDGE_TOLERANCE, ray, distance, face
-            )
+            number = _all_crossings(self.tree, *rays, ray, distance, face)
         return self._merged(ray[:number], distance[:number], face[:number], rays[1])
 
     def _merged(
@@ -242,83 +245,104 @@ def _set_direction(vector: Array, direction: Array, slowness: Array) -> None:
 
 
 @compiled_as_written
+def first_crossing(
+    tree: tuple[Array, Index, Array, float],
+    origin: Array,
+    vector: Array,
+    guess: int,
+    work: tuple[Array, Array, Index, Array],
+) -> tuple[float, int]:
+    """Return the distance of a ray's first crossing, and the place of its triangle in `tree`.
+
+    Of equally near triangles it is the one of the lowest number; inf and -1 without a crossing.
+
+    Args:
+        tree: see `RayCaster.tree`.
+        origin: (3,) m.
+        vector: (3,) of any length but zero.
+        guess: place of a triangle that the ray may cross, to save time; or -1.
+        work: see `ray_work`.
+    """
+    boxes, faces, planes, same = tree
+    direction, slowness, stack, enters = work
+    best, best_place = np.inf, NO_TRIANGLE
+    _set_direction(vector, direction, slowness)
+    if not np.isfinite(origin[0] + origin[1] + origin[2]):
+        return best, best_place
+    leaves = len(boxes) // 2
+    leaf_size = len(faces) // leaves
+    if guess >= 0:
+        t, u, v = _crossing(planes[guess], origin, direction)
+        if -same <= t < np.inf and min(u, v, 1.0 - u - v) >= -EDGE_TOLERANCE:
+            best, best_place = t, guess
+    stack[0], enters[0], size = 1, _entry(boxes[1], origin, slowness), 1
+    while size > 0:
+        size -= 1
+        box = stack[size]
+        if enters[size] > best or enters[size] == np.inf:
+            continue
+        if box >= leaves:
+            for place in range((box - leaves) * leaf_size, (box - leaves + 1) * leaf_size):
+                t, u, v = _crossing(planes[place], origin, direction)
+                if t < -same or t > best or not min(u, v, 1.0 - u - v) >= -EDGE_TOLERANCE:
+                    continue
+                if t < best or faces[place] < faces[best_place]:
+                    best, best_place = t, place
+            continue
+        near_box, far_box = 2 * box, 2 * box + 1
+        near, far = (
+            _entry(boxes[near_box], origin, slowness),
+            _entry(boxes[far_box], origin, slowness),
+        )
+        if far < near:
+            near_box, far_box, near, far = far_box, near_box, far, near
+        if far < np.inf and far <= best:
+            stack[size], enters[size] = far_box, far
+            size += 1
+        if near < np.inf and near <= best:
+            stack[size], enters[size] = near_box, near
+            size += 1
+    return best, best_place
+
+
+@compiled_as_written
+def ray_work() -> tuple[Array, Array, Index, Array]:
+    """Return the work arrays of `first_crossing`."""
+    return np.empty(3), np.empty(3), np.empty(DEEPEST, np.int64), np.empty(DEEPEST)
+
+
+@compiled_as_written
 def _first_crossings(
-    boxes: Array,
-    faces: Index,
-    planes: Array,
-    origins: Array,
-    directions: Array,
-    least: float,
-    outside: float,
+    tree: tuple[Array, Index, Array, float], origins: Array, directions: Array
 ) -> tuple[Array, Index, Array]:
     """Return the first crossing of each ray; of equally near triangles the lowest number.
 
     Args:
-        boxes: (2 p, 6) m, see `TriangleTree`.
-        faces: (p c,) triangles of the leaves.
-        planes: (p c, 12) planes of these triangles, see `_crossing`.
+        tree: see `RayCaster.tree`.
         origins: (n, 3) m.
         directions: (n, 3) of any length, or (1, 3) for all rays.
-        least: m, smallest distance of a crossing.
-        outside: 1, largest distance outside the triangle in barycentric coordinates.
 
     Returns:
         Distance (n,), m, triangle (n,) and barycentrics (n, 3); inf, -1 and NaN without a crossing.
     """
-    count, leaves = len(origins), len(boxes) // 2
-    leaf_size = len(faces) // leaves
+    count, (_, faces, planes, _) = len(origins), tree
     distance, face = np.full(count, np.inf), np.full(count, NO_TRIANGLE)
-    weights = np.full((count, 3), np.nan)
-    stack, enters = np.empty(DEEPEST, np.int64), np.empty(DEEPEST)
-    direction, slowness = np.empty(3), np.empty(3)
+    weights, work = np.full((count, 3), np.nan), ray_work()
     for n in range(count):
-        origin = origins[n]
-        if n < len(directions):
-            _set_direction(directions[n], direction, slowness)
-        if not np.isfinite(origin[0] + origin[1] + origin[2]):
-            continue
-        best, best_face, size = np.inf, NO_TRIANGLE, 1
-        stack[0], enters[0] = 1, _entry(boxes[1], origin, slowness)
-        while size > 0:
-            size -= 1
-            box = stack[size]
-            if enters[size] > best or enters[size] == np.inf:
-                continue
-            if box >= leaves:
-                for place in range((box - leaves) * leaf_size, (box - leaves + 1) * leaf_size):
-                    t, u, v = _crossing(planes[place], origin, direction)
-                    if t < least or t > best or not min(u, v, 1.0 - u - v) >= -outside:
-                        continue
-                    if t < best or faces[place] < best_face:
-                        best, best_face = t, faces[place]
-                        weights[n, 0], weights[n, 1], weights[n, 2] = 1.0 - u - v, u, v
-                continue
-            near_box, far_box = 2 * box, 2 * box + 1
-            near, far = (
-                _entry(boxes[near_box], origin, slowness),
-                _entry(boxes[far_box], origin, slowness),
-            )
-            if far < near:
-                near_box, far_box, near, far = far_box, near_box, far, near
-            if far < np.inf and far <= best:
-                stack[size], enters[size] = far_box, far
-                size += 1
-            if near < np.inf and near <= best:
-                stack[size], enters[size] = near_box, near
-                size += 1
-        distance[n], face[n] = best, best_face
+        vector = directions[n if len(directions) > 1 else 0]
+        distance[n], place = first_crossing(tree, origins[n], vector, NO_TRIANGLE, work)
+        if place >= 0:
+            face[n] = faces[place]
+            _, u, v = _crossing(planes[place], origins[n], work[0])
+            weights[n, 0], weights[n, 1], weights[n, 2] = 1.0 - u - v, u, v
     return distance, face, weights
 
 
 @compiled_as_written
 def _all_crossings(
-    boxes: Array,
-    faces: Index,
-    planes: Array,
+    tree: tuple[Array, Index, Array, float],
     origins: Array,
     directions: Array,
-    least: float,
-    outside: float,
     ray: Index,
     distance: Array,
     face: Index,
@@ -332,6 +356,7 @@ def _all_crossings(
         distance: (m,) m, output, distance of each crossing.
         face: (m,) output, triangle of each crossing.
     """
+    boxes, faces, planes, same = tree
     leaves, number = len(boxes) // 2, 0
     leaf_size = len(faces) // leaves
     stack, direction, slowness = np.empty(DEEPEST, np.int64), np.empty(3), np.empty(3)
@@ -353,7 +378,7 @@ def _all_crossings(
                 continue
             for place in range((box - leaves) * leaf_size, (box - leaves + 1) * leaf_size):
                 t, u, v = _crossing(planes[place], origin, direction)
-                if t < least or t == np.inf or not min(u, v, 1.0 - u - v) >= -outside:
+                if t < -same or t == np.inf or not min(u, v, 1.0 - u - v) >= -EDGE_TOLERANCE:
                     continue
                 if number < len(ray):
                     ray[number], distance[number], face[number] = n, t, faces[place]
