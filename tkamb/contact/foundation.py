@@ -26,7 +26,7 @@ from tkamb.contact.samples import (
     meet_nearby,
 )
 from tkamb.geometry.compiled import compiled_as_written
-from tkamb.geometry.frames import SIDES, Array, Index, Mask, inverse
+from tkamb.geometry.frames import SIDES, Array, Index, Mask
 from tkamb.units import MILLIMETRE
 
 Law = Literal["nonlinear", "linear"]
@@ -349,10 +349,9 @@ class FoundationProbe:
                 pressure, slope = self._pressures(strain)
                 self._add_up(near, meeting, pressure, slope * loaded, pose, sums)
         else:
-            back, steep = inverse(pose), MAP_POINT.side_start_normal_y
-            area, inputs = state.surface.area, self.around.inputs
+            area, steep = state.surface.area, MAP_POINT.side_start_normal_y
             deepest, near, gap, gradient, patch = _sum_nearby(
-                *inputs, back, steep, area, numbers, split, sums
+                *self.around.inputs, pose, steep, area, numbers, split, sums
             )
             self._last = pose.copy(), near, Meeting(gap, gradient, patch)
         return deepest, sums
@@ -444,9 +443,9 @@ class FoundationProbe:
         state = self._state
         split = np.inf if state.pair.split is None else state.pair.split
         curvatures = state.pair.femoral.curved.quadratics[-1]
-        columns, back = (near, state.surface.columns, state.surface.area), inverse(pose)
+        columns = near, state.surface.columns, state.surface.area
         met = meeting.gap, meeting.gradient, meeting.patch
-        _add_up(*columns, *met, curvatures, pressure, slope, back, split, sums)
+        _add_up(*columns, *met, curvatures, pressure, slope, pose, split, sums)
 
 
 @compiled_as_written
@@ -454,7 +453,7 @@ def _sum_nearby(
     columns: Columns,
     body: Body,
     memory: Memory,
-    back: Array,
+    pose: Array,
     steep: float,
     area: Array,
     numbers: Array,
@@ -465,7 +464,7 @@ def _sum_nearby(
 
     The first arguments are those of `meet_nearby`, the other ones those of `_add_up` and `_layer`.
     """
-    near, gap, gradient, patch = meet_nearby(columns, body, memory, back, steep)
+    near, gap, gradient, patch = meet_nearby(columns, body, memory, pose, steep)
     pressure, slope, deepest = np.zeros(len(near)), np.zeros(len(near)), 0.0
     for n in range(len(near)):
         if gap[n] < 0.0:
@@ -473,7 +472,7 @@ def _sum_nearby(
             deepest = max(deepest, strain)
             pressure[n], slope[n] = _layer(strain, numbers)
     _add_up(
-        near, columns, area, gap, gradient, patch, body[2][4], pressure, slope, back, split, sums
+        near, columns, area, gap, gradient, patch, body[2][4], pressure, slope, pose, split, sums
     )
     return deepest, near, gap, gradient, patch
 
@@ -507,7 +506,7 @@ def _add_up(
     curvatures: Array,
     pressure: Array,
     slope: Array,
-    back: Array,
+    pose: Array,
     split: float,
     sums: Array,
 ) -> None:
@@ -524,7 +523,7 @@ def _add_up(
             on the femur, femoral frame.
         pressure: (m,) Pa, of each column.
         slope: (m,) Pa, derivative of `pressure` by the strain.
-        back: (4, 4) pose_insert_in_femoral.
+        pose: (4, 4) pose_femoral_in_insert.
         split: m, see `medial_points`.
         sums: (2, `SUMS`) output for medial and lateral: force (N), centre (3,), m, wrench (6,) on
             the insert, its stiffness (6, 6), derivatives of the centre (3, 6) and of the force (6,)
@@ -540,11 +539,11 @@ def _add_up(
         idle = pressure[n] == 0.0 and slope[n] == 0.0
         if idle or cosine > -LEAST_COSINE:  # a column that meets the femur edge on has no load
             continue
-        length, across = 0.0, back[2, 3]
+        length, across = 0.0, 0.0
         for i in range(3):
             met[i] = gradients[n, i]
             length += met[i] ** 2
-            across += back[2, i] * points[column, i]
+            across += pose[i, 2] * (points[column, i] - pose[i, 3])
             place[i] = points[column, i] + gap[n] * normals[column, i]
         side_sums = sums[0 if across < split else 1]
         for i in range(3):
@@ -553,12 +552,12 @@ def _add_up(
             for m in range(3):
                 half[i, m] = 0.0
                 for q in range(3):
-                    half[i, m] += curvatures[patches[n], i, q] * back[q, m]
+                    half[i, m] += curvatures[patches[n], i, q] * pose[m, q]
         for i in range(3):
             for m in range(3):
                 curvature[i, m] = 0.0
                 for q in range(3):
-                    curvature[i, m] += back[q, i] * half[q, m]
+                    curvature[i, m] += pose[i, q] * half[q, m]
         size = -pressure[n] * area[column] / cosine
         rate = slope[n] * area[column] / max(thickness[column], LEAST_THICKNESS)
         weight = size * np.sqrt(length)

@@ -7,6 +7,7 @@ insert frame (x anterior, y superior, z to the right), in SI units.
 A `Probe` evaluates many neighbouring poses for a search of equilibrium.
 """
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
@@ -118,7 +119,7 @@ class CondyleWrench:
     @cached_property
     def force(self) -> float:
         """N, magnitude of the resultant."""
-        return float(np.linalg.norm(self.wrench[:3]))
+        return math.sqrt(self.wrench[:3] @ self.wrench[:3])
 
     @cached_property
     def normal(self) -> Array:

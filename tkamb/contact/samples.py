@@ -391,23 +391,28 @@ class Neighbourhood:
     def at(self, pose: Array) -> tuple[Index, Meeting]:
         """Return the near columns at a pose (4, 4), and where they meet the femoral surface."""
         steep = MAP_POINT.side_start_normal_y
-        near, gap, gradient, patch = meet_nearby(*self.inputs, inverse(pose), steep)
+        near, gap, gradient, patch = meet_nearby(*self.inputs, pose, steep)
         return near, Meeting(gap, gradient, patch)
 
 
 @compiled_as_written
 def meet_nearby(
-    columns: Columns, body: Body, memory: Memory, back: Array, steep: float
+    columns: Columns, body: Body, memory: Memory, pose: Array, steep: float
 ) -> tuple[Index, Array, Array, Index]:
     """Return the columns (m,) that the femoral component may reach, and the fields of `Meeting`.
 
     Args:
         memory: what is known of all columns; updated.
-        back: (4, 4) pose_insert_in_femoral.
+        pose: (4, 4) pose_femoral_in_insert.
         steep: `MapPointSettings.side_start_normal_y`.
     """
     points, (last_gap, last_position, places) = columns[0], memory
     near, number, place = np.empty(len(points), np.int64), 0, np.empty(3)
+    back = np.zeros((4, 4))
+    for i in range(3):
+        for k in range(3):
+            back[i, k] = pose[k, i]
+            back[i, 3] -= pose[k, i] * pose[k, 3]
     for n in range(len(points)):
         square = 0.0
         for i in range(3):

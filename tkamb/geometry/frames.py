@@ -39,6 +39,8 @@ SIDES = ("medial", "lateral")
 
 _NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
 _ALONG = np.eye(3)
+_CROSS = np.cross(_ALONG[:, None], _ALONG).swapaxes(1, 2).reshape(3, 9)
+"""The matrices of the cross product with x, y and z."""
 _TURNS = np.array([-1.0, -1.0, 1.0])
 """Signs of axial rotation, adduction and flexion as rotations about y, x and z."""
 
@@ -86,7 +88,15 @@ def rotate(pose_a_in_b: ArrayLike, vectors: ArrayLike) -> Array:
 
 def cross(a: Array, b: Array) -> Array:
     """Return the result of `np.cross` for vectors (..., 3), faster by 40 µs per call."""
+    if a.ndim == b.ndim == 1:
+        (x, y, z), (u, v, w) = a.tolist(), b.tolist()
+        return np.array([y * w - z * v, z * u - x * w, x * v - y * u])
     return a.take(_NEXT, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_NEXT, -1)
+
+
+def cross_matrix(vectors: Array) -> Array:
+    """Return the matrices (..., 3, 3) of the cross product with vectors (..., 3)."""
+    return (vectors @ _CROSS).reshape(*vectors.shape, 3)
 
 
 def knee_pose(coordinates: ArrayLike) -> Array:

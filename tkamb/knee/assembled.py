@@ -1,6 +1,7 @@
 """The parts of a knee on a user's model, and their poses at a configuration."""
 
 import copy
+import math
 import uuid
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -351,6 +352,8 @@ class AssembledKnee:
         array = real_numbers(values, f"Knee: {name}", f"give ({size},)")
         if array.shape != (size,):
             raise InputError(f"{name} has the shape {array.shape}", "Knee", f"give ({size},)")
+        if np.isfinite(array).all():
+            return array
         # Comparisons with NaN are false: a NaN in v would give forces without friction. The patella
         # of a recorded motion is NaN in a frame in which its equilibrium was not found.
         patella = self.anatomy.patella_q if name == "q" else self.anatomy.patella_v
@@ -386,10 +389,10 @@ class AssembledKnee:
         """
         if self.femoral is None or self.insert is None or not np.isfinite(pose).all():
             return
-        (low, high), bounds = self.insert.bounds, self.femoral.bounds
-        centre = pose[:3, :3] @ bounds.mean(axis=0) + pose[:3, 3]
-        apart = float(np.linalg.norm(np.maximum(np.maximum(low - centre, centre - high), 0.0)))
-        apart -= 0.5 * float(np.linalg.norm(bounds[1] - bounds[0]))
+        (low, high), (first, last) = self.insert.bounds, self.femoral.bounds
+        centre = pose[:3, :3] @ (0.5 * (first + last)) + pose[:3, 3]
+        nearest = np.minimum(np.maximum(centre, low), high)
+        apart = math.dist(centre, nearest) - 0.5 * math.dist(first, last)
         if apart > MAX_DISTANCE:
             words = f"the femoral component is {apart:.3g} m or more away from the insert"
         elif centre[1] < low[1]:

@@ -17,6 +17,7 @@ give the rates qd and qdd of the knee coordinates, for any joints of the user's 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -146,13 +147,16 @@ class KneePose:
 
     Args:
         pose: pose of the femoral component in the insert frame, shape (4, 4).
-        coordinates: knee coordinates, shape (6,), m and rad.
         patella: coordinates of the patella, shape (3,), m, m, rad; None: the model has no patella.
     """
 
     pose: Array
-    coordinates: Array
     patella: Array | None
+
+    @cached_property
+    def coordinates(self) -> Array:
+        """Knee coordinates (6,), m and rad."""
+        return knee_coordinates(self.pose)
 
 
 class Bridge:
@@ -237,7 +241,7 @@ class Bridge:
             relative = self._right(plane.actInv(patella_placement))
             rotation = np.arctan2(relative[1, 0], relative[0, 0])
             patella = np.array([relative[0, 3], relative[1, 3], rotation])
-        return KneePose(pose, knee_coordinates(pose), patella)
+        return KneePose(pose, patella)
 
     def twist(self, data: Any) -> Array:
         """Return the femur's twist (6,) relative to the insert, at the insert's origin and axes.

@@ -4,6 +4,7 @@ All vectors are in the insert frame of a right knee. A twist or a small displace
 femoral component has the linear part at the insert's origin (m/s or m), then the rotation.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -15,9 +16,9 @@ from tkamb.contact.model import CondyleWrench, ContactModel, ProbedContact
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.result import ContactStatus, Guess
 from tkamb.errors import ComputationError, InputError
-from tkamb.geometry.frames import Array, cross, displaced, pose
+from tkamb.geometry.frames import Array, cross, cross_matrix, displaced, pose
 from tkamb.knee.load import wrench_of
-from tkamb.knee.unknowns import CONTACT_POINT, CondylePoint
+from tkamb.knee.unknowns import CONTACT_POINT
 
 
 @dataclass(frozen=True)
@@ -143,10 +144,9 @@ class KneeContact:
     def _friction_wrench(self, load: CondyleWrench, twist: Array) -> Array:
         """Return the wrench (6,) of friction on the insert per unit force of a condyle."""
         sliding = twist[:3] + cross(twist[3:], load.point)
-        contact_point = CondylePoint(load.point, load.normal, sliding, 0.0)
-        return wrench_of(
-            contact_point.point, contact_point.normal - contact_point.direction(self.friction)
-        )
+        tangential = sliding - (sliding @ load.normal) * load.normal
+        speed = math.sqrt(tangential @ tangential + CONTACT_POINT.standstill_speed**2)
+        return wrench_of(load.point, self.friction / speed * tangential)
 
     def _friction_stiffness(self, load: CondyleWrench, twist: Array) -> Array:
         """Return the derivative (6, 6) of a condyle's friction by a displacement, at a twist.
@@ -160,12 +160,12 @@ class KneeContact:
         force, size, normal, point = load.wrench[:3], load.force, load.normal, load.point
         by_force, by_moment, centre = load.stiffness[:3], load.stiffness[3:], load.centre_slope
         by_size = load.force_slope
-        by_normal = -(by_force + np.outer(normal, by_size)) / size
+        by_normal = -(by_force + normal[:, None] * by_size) / size
         moment = load.wrench[3:] - cross(load.centre, force)
         by_moment = by_moment + cross_matrix(force) @ centre - cross_matrix(load.centre) @ by_force
         turned = cross_matrix(force) @ by_moment - cross_matrix(moment) @ by_force
         by_point = (
-            centre + turned / size**2 - 2.0 / size**3 * np.outer(cross(force, moment), by_size)
+            centre + turned / size**2 - 2.0 / size**3 * cross(force, moment)[:, None] * by_size
         )
         sliding = twist[:3] + cross(twist[3:], point)
         by_sliding = cross_matrix(twist[3:]) @ by_point
@@ -174,15 +174,15 @@ class KneeContact:
         # Product rule for t = s - (s . n) n.
         by_tangential = (
             by_sliding
-            - np.outer(normal, normal @ by_sliding + sliding @ by_normal)
+            - normal[:, None] * (normal @ by_sliding + sliding @ by_normal)
             - along * by_normal
         )
         speed = float(np.sqrt(tangential @ tangential + CONTACT_POINT.standstill_speed**2))
         direction = self.friction * tangential / speed
         by_direction = self.friction * (
-            by_tangential / speed - np.outer(tangential, tangential @ by_tangential) / speed**3
+            by_tangential / speed - tangential[:, None] * (tangential @ by_tangential) / speed**3
         )
-        change = np.outer(direction, by_size) + size * by_direction
+        change = direction[:, None] * by_size + size * by_direction
         by_moment = cross_matrix(point) @ change - size * cross_matrix(direction) @ by_point
         return np.vstack([change, by_moment])
 
@@ -200,8 +200,8 @@ class KneeContact:
             sliding = point_jacobian @ twist
             tangential = sliding - (sliding @ normal) * normal
             speed = float(np.sqrt(tangential @ tangential + CONTACT_POINT.standstill_speed**2))
-            projector = np.eye(3) - np.outer(normal, normal)
-            derivative = projector / speed - np.outer(tangential, tangential) / speed**3
+            projector = np.eye(3) - normal[:, None] * normal
+            derivative = projector / speed - tangential[:, None] * tangential / speed**3
             # Chain rule: the twist gives the velocity of the contact point, and this the friction.
             total += self.friction * load.force * point_jacobian.T @ derivative @ point_jacobian
         return total
@@ -247,12 +247,6 @@ class KneeContact:
             femur_pose,
             settings,
         )
-
-
-def cross_matrix(vector: Array) -> Array:
-    """Return the matrix (3, 3) of the cross product with a vector."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def batch_differences(

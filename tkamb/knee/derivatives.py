@@ -42,7 +42,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pinocchio as pin
 
-from tkamb.geometry.frames import Array, displaced
+from tkamb.geometry.frames import Array, cross_matrix, displaced
 from tkamb.knee.anatomy import FixedFrame
 from tkamb.knee.canonical import KneePose, mirrored_spatial, summed
 
@@ -88,10 +88,10 @@ class RelativeTwists:
     coordinates: Array | None
 
 
-def force_derivatives(
+def forces_and_derivatives(
     knee: "Knee", q: Array, v: Array, tensions: Any, data: "KneeData"
-) -> tuple[Array, Array]:
-    """Return the result of `Knee.external_forces_derivatives`."""
+) -> tuple[Any, Array, Array]:
+    """Return the results of `Knee.external_forces` and `Knee.external_forces_derivatives`."""
     if knee.contact is not None:
         knee.contact.check_differentiable()
     twists = relative_twists(knee, q, data)
@@ -103,7 +103,7 @@ def force_derivatives(
         wrenches[link] = wrenches[link] + wrench
         by_q[link] = by_q[link] + slopes[link]
     shape = knee.model.njoints, 6, knee.model.nv
-    df_dq, df_dv = np.zeros(shape), np.zeros(shape)
+    forces, df_dq, df_dv = np.zeros(shape[:2]), np.zeros(shape), np.zeros(shape)
     for link in LINKS:
         joint, to_joint = knee.bridge.joint_of(link), knee.bridge.to_joint(data.data, link)
         wrench, change, rate = (_users(knee, m[link]) for m in (wrenches, by_q, by_v))
@@ -111,21 +111,20 @@ def force_derivatives(
         # The tibia does not move against the insert; the other bodies do.
         if twist is not None:
             change = change - force_cross(twist, wrench)
+        forces[joint] += to_joint @ wrench
         df_dq[joint] += to_joint @ change
         df_dv[joint] += to_joint @ rate
     for name, line in knee._lines.items():
         if tension := muscle_tensions.get(name, 0.0):
             line.add_derivatives(knee.model, data.data, tension, df_dq)
-    return df_dq, df_dv
+    on_joints = pin.StdVec_Force([pin.Force(force) for force in forces])
+    return knee._with_lines(data, muscle_tensions, on_joints), df_dq, df_dv
 
 
 def force_cross(twists: Array, wrench: Array) -> Array:
     """Return xi x* w (6, n) of twists xi (6, n) and a wrench w (6,)."""
-    linear, angular = twists[:3].T, twists[3:].T
-    force, moment = wrench[:3], wrench[3:]
-    return np.concatenate(
-        [np.cross(angular, force), np.cross(angular, moment) + np.cross(linear, force)], axis=1
-    ).T
+    force, moment = cross_matrix(wrench.reshape(2, 3))
+    return -np.concatenate([force @ twists[3:], moment @ twists[3:] + force @ twists[:3]])
 
 
 def relative_twists(knee: "Knee", q: Array, data: "KneeData") -> RelativeTwists:
@@ -141,8 +140,8 @@ def relative_twists(knee: "Knee", q: Array, data: "KneeData") -> RelativeTwists:
     plane = pin_data.oMi[anatomy.plane.joint] * anatomy.plane.placement
     placement = pin_data.oMi[anatomy.patella.joint] * anatomy.patella.placement
     pose = bridge.of_right_knee(plane.actInv(placement))
-    centre = in_plane[:3] + np.cross(in_plane[3:].T, pose[:3, 3]).T
-    front = np.cross(in_plane[3:].T, pose[:3, 0]).T
+    centre = in_plane[:3] - cross_matrix(pose[:3, 3]) @ in_plane[3:]
+    front = -cross_matrix(pose[:3, 0]) @ in_plane[3:]
     # The rotation is the angle of the patella's x axis in the plane: d atan2(y, x).
     x, y = pose[0, 0], pose[1, 0]
     rotation = (x * front[1] - y * front[0]) / (x**2 + y**2)
@@ -368,14 +367,14 @@ def _edge_free(values: Callable[[Array], Array], sizes: Array, step: float) -> A
 
 
 def generalised(model: Any, data: Any, changes: Array) -> Array:
-    """Return sum_j J_j^T df_j (nv, nv) of changes df (njoints, 6, nv) of the joints' forces.
+    """Return sum_j J_j^T df_j (nv, k) of changes df (njoints, 6, k) of the joints' forces.
 
     Args:
         model: the user's model.
         data: Pinocchio data after `pin.computeJointJacobians`.
         changes: derivative of each joint's force in its joint's frame.
     """
-    total = np.zeros((model.nv, model.nv))
+    total = np.zeros((model.nv, changes.shape[2]))
     for joint in range(1, model.njoints):
         if changes[joint].any():
             local = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.LOCAL)

@@ -181,9 +181,10 @@ class Knee(AssembledKnee):
 
             return forces_of_all(self, q, v, tensions, data)
         kinematics = self._kinematics(data, q, v)
-        self._check_place(kinematics.pose)
         on_insert = np.zeros(6)
-        if self.contact is not None:
+        if self.contact is None:
+            self._check_place(kinematics.pose)
+        else:
             contact = self._contact_at(data, kinematics)
             on_insert = self.contact.wrench(contact, self.bridge.twist(data.data))
         if self._crossing is not None:
@@ -332,9 +333,9 @@ class Knee(AssembledKnee):
                 facet (`hertz`).
             ComputationError: see `external_forces`.
         """
-        from tkamb.knee.derivatives import force_derivatives
+        from tkamb.knee.derivatives import forces_and_derivatives
 
-        return force_derivatives(self, q, v, tensions, self._data(data))
+        return forces_and_derivatives(self, q, v, tensions, self._data(data))[1:]
 
     def forward_dynamics(
         self,
@@ -380,14 +381,9 @@ class Knee(AssembledKnee):
             InputError: see `external_forces`.
             ComputationError: see `external_forces`.
         """
-        from tkamb.knee.derivatives import generalised
-
         data = self._data(data)
         model, pin_data = self.model, data.data
-        forces = self._with_external(self.external_forces(q, v, tensions, data), fext)
-        by_q, by_v = self.external_forces_derivatives(q, v, tensions, data)
-        # Pinocchio's derivatives change the Jacobians in `data`.
-        change, rate = (generalised(model, pin_data, one) for one in (by_q, by_v))
+        forces, change, rate = self._generalised_derivatives(q, v, fext, tensions, data)
         pin.computeABADerivatives(model, pin_data, q, v, self._check_tau(tau), forces)
         inverse_mass = np.array(pin_data.Minv)
         return (
@@ -424,17 +420,23 @@ class Knee(AssembledKnee):
             InputError: see `external_forces`.
             ComputationError: see `external_forces`.
         """
-        from tkamb.knee.derivatives import generalised
-
         data = self._data(data)
         model, pin_data = self.model, data.data
-        forces = self._with_external(self.external_forces(q, v, tensions, data), fext)
-        by_q, by_v = self.external_forces_derivatives(q, v, tensions, data)
-        change, rate = (generalised(model, pin_data, one) for one in (by_q, by_v))
+        forces, change, rate = self._generalised_derivatives(q, v, fext, tensions, data)
         a = self._check(a, "a", model.nv)
         by_q, by_v, by_a = pin.computeRNEADerivatives(model, pin_data, q, v, a, forces)
         mass = np.triu(by_a) + np.triu(by_a, 1).T
         return by_q - change, by_v - rate, mass
+
+    def _generalised_derivatives(
+        self, q: Array, v: Array, fext: Any, tensions: Any, data: KneeData
+    ) -> tuple[Any, Array, Array]:
+        """Return the forces with `fext`, and the derivatives (nv, nv) of sum_j J_j^T f_j."""
+        from tkamb.knee.derivatives import forces_and_derivatives, generalised
+
+        forces, *changes = forces_and_derivatives(self, q, v, tensions, data)
+        total = generalised(self.model, data.data, np.concatenate(changes, axis=2))
+        return self._with_external(forces, fext), *np.hsplit(total, 2)
 
     def _with_external(self, forces: Any, fext: Any) -> Any:
         if fext is None:

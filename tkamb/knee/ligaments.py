@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tkamb.errors import InputError, names_near
-from tkamb.geometry.frames import Array, inverse, transform
+from tkamb.geometry.frames import Array, cross_matrix, inverse, transform
 from tkamb.geometry.surface import Surface
 from tkamb.knee.chain import Chain
 from tkamb.knee.ligament_laws import LIGAMENT_LAWS, LigamentLaw, StackedLaws, TwoLine
@@ -187,7 +187,7 @@ class BundleArrays:
             distal: distal ends in the same frame, shape (..., m, 3), m.
         """
         along = proximal - distal
-        length = np.linalg.norm(along, axis=-1)
+        length = np.sqrt((along * along).sum(axis=-1))
         tension = self.laws.tension(length, self.slack_length)
         return tension, (tension / length)[..., None] * along
 
@@ -205,16 +205,14 @@ class BundleArrays:
         along = proximal - self.distal
         length = np.linalg.norm(along, axis=-1)
         tension, _ = self.pulls(proximal, self.distal)
-        slope = self.laws.slope(length, self.slack_length)
-        total, eye = np.zeros((6, 6)), np.eye(3)
-        for p, d, u, t, k, size in zip(
-            proximal, self.distal, along / length[:, None], tension, slope, length, strict=True
-        ):
-            if k or t:
-                change = t / size * (eye - np.outer(u, u)) + k * np.outer(u, u)
-                move = np.hstack([eye, np.cross(p, eye)])
-                by_displacement = change @ move
-                total += np.vstack([by_displacement, np.cross(d, by_displacement.T).T])
+        slope, ratio = self.laws.slope(length, self.slack_length), tension / length
+        directions = along / length[:, None]
+        square = directions[:, :, None] * directions[:, None, :]
+        change = ratio[:, None, None] * np.eye(3) + (slope - ratio)[:, None, None] * square
+        by_rotation = -change @ cross_matrix(proximal)
+        by_displacement = np.concatenate([change, by_rotation], axis=2)
+        moment = cross_matrix(self.distal) @ by_displacement
+        total = np.concatenate([by_displacement.sum(axis=0), moment.sum(axis=0)])
         if self.wrapping:
             from tkamb.knee.contact import DifferenceSettings, differences
 
@@ -228,8 +226,7 @@ class BundleArrays:
         Args:
             poses: pose of the proximal frame in the distal frame, shape (..., 4, 4).
         """
-        proximal = np.einsum("...ij,mj->...mi", poses[..., :3, :3], self.proximal)
-        proximal = proximal + poses[..., None, :3, 3]
+        proximal = self.proximal @ poses[..., :3, :3].swapaxes(-1, -2) + poses[..., None, :3, 3]
         _, pull = self.pulls(proximal, self.distal)
         total = wrench_of(self.distal, pull).sum(axis=-2)
         return total + self._wrapping_wrench(poses) if self.wrapping else total

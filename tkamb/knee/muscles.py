@@ -15,7 +15,7 @@ import numpy as np
 import pinocchio as pin
 
 from tkamb.errors import ComputationError, InputError, must_be, names_near, real_number
-from tkamb.geometry.frames import Array, cross, transform
+from tkamb.geometry.frames import Array, cross, cross_matrix, transform
 from tkamb.geometry.polygons import sagittal_outline
 from tkamb.knee.anatomy import Anatomy, FixedFrame
 from tkamb.knee.load import LinkPoint, PointForces, link_point
@@ -308,7 +308,7 @@ class TensionLine:
                 local = found.reshape(6, -1)
             in_joint = placement.actInv(point)
             spins.append(local[3:])
-            moves.append(placement.rotation @ (local[:3] + np.cross(local[3:].T, in_joint).T))
+            moves.append(placement.rotation @ (local[:3] - cross_matrix(in_joint) @ local[3:]))
         steps = np.diff(points, axis=0)
         lengths = np.linalg.norm(steps, axis=1)
         directions = steps / lengths[:, None]
@@ -326,9 +326,9 @@ class TensionLine:
             pull = back @ (tension * (ahead[k] - behind[k]))
             change = back @ (tension * (ahead_turn[k] - behind_turn[k]))
             # The axes of the joint turn under the force.
-            change = change - np.cross(spins[k].T, pull).T
+            change = change + cross_matrix(pull) @ spins[k]
             changes[frame.joint, :3] += change
-            changes[frame.joint, 3:] += np.cross(placement.actInv(points[k]), change.T).T
+            changes[frame.joint, 3:] += cross_matrix(placement.actInv(points[k])) @ change
 
 
 def tension_lines(muscles: Iterable[Muscle], anatomy: Anatomy) -> dict[str, TensionLine]:

@@ -31,10 +31,17 @@ from typing import Any
 import numpy as np
 
 from tkamb.errors import ComputationError, InputError, names_near
-from tkamb.geometry.frames import PATELLA_BODY_COORDINATES, Array, cross, inverse, pose, transform
+from tkamb.geometry.frames import (
+    PATELLA_BODY_COORDINATES,
+    Array,
+    cross,
+    cross_matrix,
+    inverse,
+    pose,
+    transform,
+)
 from tkamb.knee.balance import Balance, BalanceStatus, Trial, find_balance
 from tkamb.knee.button import Button
-from tkamb.knee.contact import cross_matrix
 from tkamb.knee.ligaments import DISTAL, PROXIMAL, BundleArrays, Ligament
 from tkamb.knee.wrapping import TautPath, path_in_link
 from tkamb.units import MILLIMETRE
