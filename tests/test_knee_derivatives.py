@@ -169,7 +169,7 @@ def test_an_equilibrium(read, monkeypatch):
     monkeypatch.setattr(balance, "BALANCE", sharp)
     passes = replace(
         released.RELEASED_KNEE,
-        knee_tolerance=1e-10,
+        knee_tolerance=1e-12,  # at 1e-10 the reference is sometimes too coarse
         contact_force_tolerance=1e-6,
         contact_force_share=0.0,
     )

@@ -4,7 +4,6 @@ All vectors are in the insert frame of a right knee. A twist or a small displace
 femoral component has the linear part at the insert's origin (m/s or m), then the rotation.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -16,8 +15,8 @@ from tkamb.contact.model import CondyleWrench, ContactModel, ProbedContact
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.result import ContactStatus, Guess
 from tkamb.errors import ComputationError, InputError
-from tkamb.geometry.frames import Array, cross, cross_matrix, displaced, pose
-from tkamb.knee.load import wrench_of
+from tkamb.geometry.compiled import compiled_as_written
+from tkamb.geometry.frames import Array, displaced, pose
 from tkamb.knee.unknowns import CONTACT_POINT
 
 
@@ -40,6 +39,9 @@ class DifferenceSettings:
 
 
 CONTACT_DIFFERENCE = DifferenceSettings()
+UNCHANGED = np.zeros((15, 0))
+BY_TWIST = np.vstack([np.zeros((9, 6)), np.eye(6)])
+"""Changes of `_friction_wrench` by the twist."""
 
 
 class KneeContact:
@@ -138,72 +140,22 @@ class KneeContact:
         for load in contact.loads:
             total += load.wrench
             if self.friction:
-                total += load.force * self._friction_wrench(load, twist)
+                total += self._friction(load, twist, UNCHANGED)[:, 0]
         return total
 
-    def _friction_wrench(self, load: CondyleWrench, twist: Array) -> Array:
-        """Return the wrench (6,) of friction on the insert per unit force of a condyle."""
-        sliding = twist[:3] + cross(twist[3:], load.point)
-        tangential = sliding - (sliding @ load.normal) * load.normal
-        speed = math.sqrt(tangential @ tangential + CONTACT_POINT.standstill_speed**2)
-        return wrench_of(load.point, self.friction / speed * tangential)
-
-    def _friction_stiffness(self, load: CondyleWrench, twist: Array) -> Array:
-        """Return the derivative (6, 6) of a condyle's friction by a displacement, at a twist.
-
-        The force is mu N t/s in the notation of `damping`. N, the normal n and the contact point p
-        change with the wrench (f, m) and the centre c of the pressure: with m_c = m - c x f,
-
-            dN = -n . df,    dn = -(df + n dN)/N,    p = c + f x m_c/N².
-        """
-        assert load.stiffness is not None and load.centre_slope is not None
-        force, size, normal, point = load.wrench[:3], load.force, load.normal, load.point
-        by_force, by_moment, centre = load.stiffness[:3], load.stiffness[3:], load.centre_slope
-        by_size = load.force_slope
-        by_normal = -(by_force + normal[:, None] * by_size) / size
-        moment = load.wrench[3:] - cross(load.centre, force)
-        by_moment = by_moment + cross_matrix(force) @ centre - cross_matrix(load.centre) @ by_force
-        turned = cross_matrix(force) @ by_moment - cross_matrix(moment) @ by_force
-        by_point = (
-            centre + turned / size**2 - 2.0 / size**3 * cross(force, moment)[:, None] * by_size
-        )
-        sliding = twist[:3] + cross(twist[3:], point)
-        by_sliding = cross_matrix(twist[3:]) @ by_point
-        along = float(sliding @ normal)
-        tangential = sliding - along * normal
-        # Product rule for t = s - (s . n) n.
-        by_tangential = (
-            by_sliding
-            - normal[:, None] * (normal @ by_sliding + sliding @ by_normal)
-            - along * by_normal
-        )
-        speed = float(np.sqrt(tangential @ tangential + CONTACT_POINT.standstill_speed**2))
-        direction = self.friction * tangential / speed
-        by_direction = self.friction * (
-            by_tangential / speed - tangential[:, None] * (tangential @ by_tangential) / speed**3
-        )
-        change = direction[:, None] * by_size + size * by_direction
-        by_moment = cross_matrix(point) @ change - size * cross_matrix(direction) @ by_point
-        return np.vstack([change, by_moment])
+    def _friction(self, load: CondyleWrench, twist: Array, changes: Array) -> Array:
+        """Return the wrench of friction on the insert, and its changes; see `_friction_wrench`."""
+        still = CONTACT_POINT.standstill_speed
+        return _friction_wrench(load.wrench, load.centre, twist, changes, self.friction, still)
 
     def damping(self, contact: ProbedContact, twist: Array) -> Array:
         """Return the derivative (6, 6) of the wrench on the insert with respect to the twist.
 
-        Only friction depends on the femur's twist. Let v be the sliding velocity at a contact
-        point, t its tangential part, s = sqrt(t.t + v0²) and P the projector on the tangent plane.
-        The derivative of the friction force mu N t/s by v is mu N (P/s - t t^T/s³).
+        Only friction depends on the femur's twist.
         """
         total = np.zeros((6, 6))
         for load in contact.loads if self.friction else ():
-            normal, point = load.normal, load.point
-            point_jacobian = np.hstack([np.eye(3), -cross_matrix(point)])
-            sliding = point_jacobian @ twist
-            tangential = sliding - (sliding @ normal) * normal
-            speed = float(np.sqrt(tangential @ tangential + CONTACT_POINT.standstill_speed**2))
-            projector = np.eye(3) - normal[:, None] * normal
-            derivative = projector / speed - tangential[:, None] * tangential / speed**3
-            # Chain rule: the twist gives the velocity of the contact point, and this the friction.
-            total += self.friction * load.force * point_jacobian.T @ derivative @ point_jacobian
+            total += self._friction(load, twist, BY_TWIST)[:, 1:]
         return total
 
     def stiffness(
@@ -233,9 +185,11 @@ class KneeContact:
                 assert load.stiffness is not None
                 total += load.stiffness
                 if has_friction and load.centre_slope is not None:
-                    total += self._friction_stiffness(load, twist)
+                    changes = np.concatenate([load.stiffness, load.centre_slope, np.zeros((6, 6))])
+                    total += self._friction(load, twist, changes)[:, 1:]
                 elif has_friction:
-                    total += np.outer(self._friction_wrench(load, twist), load.force_slope)
+                    wrench = self._friction(load, twist, UNCHANGED)[:, 0]
+                    total += np.outer(wrench / load.force, load.force_slope)
             return total
         precise = self.precise_probe(getattr(probe, "start", None))
         self.at(precise, femur_pose)
@@ -247,6 +201,82 @@ class KneeContact:
             femur_pose,
             settings,
         )
+
+
+Vector = tuple[float, float, float]
+
+
+@compiled_as_written
+def _friction_wrench(
+    wrench: Array, centre: Array, twist: Array, changes: Array, friction: float, still: float
+) -> Array:
+    """Return the wrench of a condyle's friction on the insert, and its changes (6, 1 + k).
+
+    The resultant f of size N acts along the normal n = -f/N, at the point p = c + f x m_c/N² with
+    the moment m_c = m - c x f about the centre c. With the sliding velocity s = v + w x p and its
+    tangential part t = s - (s . n) n, the friction is mu N t/sqrt(t . t + v0²), at p.
+
+    Args:
+        wrench: (6,) f (N) and m (N·m) on the insert.
+        centre: (3,) m, centre of pressure.
+        twist: (6,) v (m/s) and w (rad/s) of the femur against the insert.
+        changes: (15, k) changes of wrench, centre and twist.
+        friction: 1, mu.
+        still: m/s, v0.
+    """
+    f, m, c = _three(wrench, 0), _three(wrench, 3), _three(centre, 0)
+    v, w = _three(twist, 0), _three(twist, 3)
+    result, size = np.empty((6, 1 + changes.shape[1])), np.sqrt(_dot(f, f))
+    n, free = _plus((0.0, 0.0, 0.0), -1.0 / size, f), _plus(m, -1.0, _cross(c, f))
+    arm = _cross(f, free)
+    p = _plus(c, 1.0 / size**2, arm)
+    s = _plus(v, 1.0, _cross(w, p))
+    along = _dot(s, n)
+    t = _plus(s, -along, n)
+    speed = np.sqrt(_dot(t, t) + still**2)
+    ratio = friction * size / speed
+    force = _plus((0.0, 0.0, 0.0), ratio, t)
+    moment = _cross(p, force)
+    for i in range(3):
+        result[i, 0], result[3 + i, 0] = force[i], moment[i]
+    for k in range(changes.shape[1]):
+        column = changes[:, k]
+        df, dm, dc = _three(column, 0), _three(column, 3), _three(column, 6)
+        dv, dw = _three(column, 9), _three(column, 12)
+        dsize = -_dot(n, df)
+        dn = _plus((0.0, 0.0, 0.0), -1.0 / size, _plus(df, dsize, n))
+        dfree = _plus(_plus(dm, -1.0, _cross(dc, f)), -1.0, _cross(c, df))
+        darm = _plus(_cross(df, free), 1.0, _cross(f, dfree))
+        dp = _plus(_plus(dc, 1.0 / size**2, darm), -2.0 * dsize / size**3, arm)
+        ds = _plus(_plus(dv, 1.0, _cross(dw, p)), 1.0, _cross(w, dp))
+        dt = _plus(_plus(ds, -_dot(ds, n) - _dot(s, dn), n), -along, dn)
+        dratio = friction * dsize / speed - ratio * _dot(t, dt) / speed**2
+        dforce = _plus(_plus((0.0, 0.0, 0.0), ratio, dt), dratio, t)
+        dmoment = _plus(_cross(dp, force), 1.0, _cross(p, dforce))
+        for i in range(3):
+            result[i, 1 + k], result[3 + i, 1 + k] = dforce[i], dmoment[i]
+    return result
+
+
+@compiled_as_written
+def _three(values: Array, first: int) -> Vector:
+    return values[first], values[first + 1], values[first + 2]
+
+
+@compiled_as_written
+def _dot(a: Vector, b: Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@compiled_as_written
+def _plus(a: Vector, factor: float, b: Vector) -> Vector:
+    return a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2]
+
+
+@compiled_as_written
+def _cross(a: Vector, b: Vector) -> Vector:
+    x, y, z = a
+    return y * b[2] - z * b[1], z * b[0] - x * b[2], x * b[1] - y * b[0]
 
 
 def batch_differences(

@@ -94,9 +94,9 @@ def forces_and_derivatives(
     """Return the results of `Knee.external_forces` and `Knee.external_forces_derivatives`."""
     if knee.contact is not None:
         knee.contact.check_differentiable()
-    twists = relative_twists(knee, q, data)
-    kinematics = knee._kinematics(data, q, v)
     muscle_tensions = knee._tensions(tensions)
+    twists = relative_twists(knee, q, data, knee._loads_patella(muscle_tensions))
+    kinematics = knee._kinematics(data, q, v)
     wrenches, by_q, by_v = _between(knee, data, kinematics, twists, q, v)
     beside, slopes = _beside(knee, data, kinematics, muscle_tensions, twists)
     for link, wrench in beside.items():
@@ -104,7 +104,7 @@ def forces_and_derivatives(
         by_q[link] = by_q[link] + slopes[link]
     shape = knee.model.njoints, 6, knee.model.nv
     forces, df_dq, df_dv = np.zeros(shape[:2]), np.zeros(shape), np.zeros(shape)
-    for link in LINKS:
+    for link in LINKS if beside else LINKS[:2]:
         joint, to_joint = knee.bridge.joint_of(link), knee.bridge.to_joint(data.data, link)
         wrench, change, rate = (_users(knee, m[link]) for m in (wrenches, by_q, by_v))
         twist = {"femur": twists.femur, "patella": twists.patella}.get(link)
@@ -127,10 +127,15 @@ def force_cross(twists: Array, wrench: Array) -> Array:
     return -np.concatenate([force @ twists[3:], moment @ twists[3:] + force @ twists[:3]])
 
 
-def relative_twists(knee: "Knee", q: Array, data: "KneeData") -> RelativeTwists:
-    """Return the twists of femur and patella at q, and update `data`."""
+def relative_twists(
+    knee: "Knee", q: Array, data: "KneeData", loads_patella: bool
+) -> RelativeTwists:
+    """Return the twists of femur and patella at q, and update `data`.
+
+    Those of a patella without a load are not computed.
+    """
     femur, bridge, anatomy = knee.relative_jacobian(q, data), knee.bridge, knee.anatomy
-    if anatomy.patella is None or knee.extensor is None:
+    if anatomy.patella is None or knee.extensor is None or not loads_patella:
         return RelativeTwists(femur, femur, None)
     pin_data = data.data
     patella = _relative_jacobian(knee.model, pin_data, anatomy.patella, bridge.insert)
