@@ -20,18 +20,19 @@ from tkamb.contact.foundation import (
     layer_pressure,
     layer_slope,
 )
-from tkamb.contact.materials import material
+from tkamb.contact.materials import material, tabulated_material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import PRESS, press_by_search, search_load
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactStatus
-from tkamb.contact.samples import sample_surface
+from tkamb.contact.samples import meet, sample_surface
 from tkamb.errors import InputError
 from tkamb.geometry.frames import inverse, knee_pose, knee_twist, pose
 from tkamb.geometry.surface import Surface
 from tkamb.knee.contact import CONTACT_DIFFERENCE, differences
 
 LINEAR = material("polyethylene-linear")
+POLYETHYLENE = material("polyethylene")
 M = LINEAR.confined_modulus
 RADIUS, HEIGHT = 30e-3, 10e-3
 
@@ -359,7 +360,7 @@ def test_a_failed_guess_or_one_with_other_map_points_is_not_used():
 
 
 @cache
-def two_dishes():
+def two_dishes(bulk=None):
     """Return a rounded, two-condyle component in two dishes: normals of both bodies differ."""
     insert = dished_insert(
         lambda x, z: 8e-3 + x**2 / (2 * 50e-3) + (np.abs(z) - 12e-3) ** 2 / (2 * 60e-3),
@@ -367,7 +368,7 @@ def two_dishes():
         spacing=1e-3,
     )
     model = ElasticFoundation(2e-3)
-    return model, model.prepare(ContactPair(two_spheres(), insert, material("polyethylene")))
+    return model, model.prepare(ContactPair(two_spheres(), insert, bulk or POLYETHYLENE))
 
 
 def loop_work(probe, centre, amplitude, phase, steps):
@@ -429,8 +430,39 @@ def test_the_map_holds_a_ball_on_a_plate_with_the_closed_form(cell, depth):
     assert -waves / loads == pytest.approx(expected, rel=0.05)
 
 
-def test_the_stiffness_is_the_slope_of_the_wrench():
-    model, state = two_dishes()
+CURVE = np.linspace(0.0, 0.3, 31)
+TABLE = tabulated_material("table", CURVE, POLYETHYLENE.stress(CURVE), 0.45)
+"""The law of a table is not compiled."""
+
+
+@pytest.mark.parametrize("law", ["linear", "nonlinear"])
+@pytest.mark.parametrize("bulk", [POLYETHYLENE, LINEAR, TABLE], ids=lambda bulk: bulk.name)
+def test_the_compiled_sums_agree_with_numpy(law, bulk):
+    """Wrench and centre of each condyle: columns push with p A along the femoral normal."""
+    model, state = two_dishes(bulk)
+    model = replace(model, law=law)
+    at = model.press(state, 1500.0, knee_pose([1e-3, 0, 3e-4, 0.01, 0.0, 0.2])).pose
+    bed, met = state.surface, meet(state.surface, state.pair.femoral, at)
+    pressure = layer_pressure(law, bulk, np.maximum(-met.gap, 0.0) / bed.thickness)
+    along = np.einsum("ij,ij->i", met.gradient, bed.normals)
+    forces = (-pressure * bed.area / np.where(along, along, 1.0))[:, None] * met.gradient
+    places, size = bed.points + met.gap[:, None] * bed.normals, np.linalg.norm(forces, axis=1)
+    medial = (bed.points - at[:3, 3]) @ at[:3, 2] < state.pair.split
+    found = model.probe(state).at(at).condyles
+    assert set(found) == {"medial", "lateral"}
+    for side, chosen in (("medial", medial), ("lateral", ~medial)):
+        chosen = chosen & (pressure > 0.0)
+        force = forces[chosen].sum(axis=0)
+        moment = np.cross(places[chosen], forces[chosen]).sum(axis=0)
+        wrench, centre = np.append(force, moment), size[chosen] @ bed.points[chosen]
+        scale = 1e-12 * np.abs(wrench).max()
+        np.testing.assert_allclose(found[side].wrench, wrench, rtol=1e-12, atol=scale)
+        np.testing.assert_allclose(found[side].centre, centre / size[chosen].sum(), 1e-12, 1e-15)
+
+
+@pytest.mark.parametrize("bulk", [POLYETHYLENE, LINEAR, TABLE], ids=lambda bulk: bulk.name)
+def test_the_stiffness_is_the_slope_of_the_wrench(bulk):
+    model, state = two_dishes(bulk)
     pressed = model.press(state, 1500.0, knee_pose([1e-3, 0, 3e-4, 0.01, 0.0, 0.2]))
     probe = model.probe(state)
     stiffness = sum(load.stiffness for load in probe.at(pressed.pose).loads)

@@ -2,6 +2,7 @@
 
 import inspect
 import re
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,6 +46,31 @@ def lowered(knee, q, load=1200.0):
     q = q.copy()
     q[8] = knee.press(q, load).pose.translation[1]
     return q
+
+
+def test_two_threads_with_data_of_their_own_agree_with_one(read):
+    """To the last bit: they share the knee, its contact and its compiled loops."""
+    knee, motion, _ = read
+
+    def work(frame):
+        data, rows = knee.create_data(), []
+        for k in range(frame, frame + 12):
+            q = motion.q[k].copy()
+            result = knee.press(q, 1000.0, data)
+            q[knee.model.joints[knee.model.getJointId("knee_si")].idx_q] += (
+                result.pose.translation[1] - knee.coordinates(q)[1]
+            )
+            forces = knee.external_forces(q, motion.v[k], data=data)
+            slopes = knee.external_forces_derivatives(q, motion.v[k], data=data)
+            rows += [result.pressure, *(force.vector for force in forces), *slopes]
+        return rows
+
+    frames = (40, 45, 40, 60)
+    with ThreadPoolExecutor(2) as pool:
+        together = list(pool.map(work, frames))
+    for frame, found in zip(frames, together, strict=True):
+        for one, other in zip(found, work(frame), strict=True):
+            assert np.array_equal(one, other)
 
 
 def test_a_left_knee_answers_in_its_own_frames(sides):
