@@ -16,7 +16,12 @@ from tkamb.commands.help_examples import add_examples
 from tkamb.commands.import_model import add_data, add_import
 from tkamb.commands.mesh import add_contact, add_mesh, add_no_cache, add_press, without_cache
 from tkamb.commands.options import add_preset, add_scene_options, check_options, overrides_of
-from tkamb.commands.results import add_compare, add_export, add_folder_commands
+from tkamb.commands.results import (
+    add_compare,
+    add_export,
+    add_folder_commands,
+    reading_results,
+)
 from tkamb.commands.settings import add_settings
 from tkamb.commands.studies import add_cohort, add_stability, add_tradeoff
 from tkamb.commands.uncertainty import add_uncertainty
@@ -48,7 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         check_options(parser, sys.argv[1:] if arguments is None else arguments, options)
         threads()  # raises if TKAMB_THREADS is invalid
         log_to_stderr()
-        return int(options.command(options))
+        with reading_results(options):
+            return int(options.command(options))
 
     return guarded(command, options)
 

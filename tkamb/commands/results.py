@@ -2,14 +2,41 @@
 
 import argparse
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from tkamb.errors import InputError
+from tkamb.errors import InputError, TkambError
 from tkamb.run.guard import say
 from tkamb.units import MILLIMETRE
 
 PAGE_NAME = "compare.html"
+_NAMES = ("folder", "folders", "runs", "path", "case")
+"""Options of all commands that may name a folder of results."""
+
+
+@contextmanager
+def reading_results(options: argparse.Namespace) -> Iterator[None]:
+    """Name the folders of results in the error of a command that cannot use their content.
+
+    Raises:
+        InputError: the command reads a folder of results, and content of another kind than this
+            version writes stops it.
+    """
+    try:
+        yield
+    except (TkambError, OSError, MemoryError):
+        raise
+    except Exception as error:  # content of another kind raises errors of many types
+        given = [getattr(options, name, None) or [] for name in _NAMES]
+        paths = [path for each in given for path in (each if isinstance(each, list) else [each])]
+        folders = [str(path) for path in paths if (Path(path) / "summary.json").is_file()]
+        if not folders:
+            raise
+        words = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        what = f"cannot be read by this version of tkamb ({words})"
+        raise InputError(what, ", ".join(folders), "run the scene again") from error
 
 
 def add_compare(commands: Any) -> None:
