@@ -209,7 +209,6 @@ def _contact_list(options: argparse.Namespace) -> int:
 
 
 def _add_units(command: argparse.ArgumentParser, what: str) -> None:
-    """Add --units, which `tkamb import` calls --mesh-unit."""
     command.add_argument(
         *UNIT_OPTIONS,
         dest="units",
@@ -220,7 +219,6 @@ def _add_units(command: argparse.ArgumentParser, what: str) -> None:
 
 
 def _add_side(command: argparse.ArgumentParser) -> None:
-    """Add --axes and --side, the orientation of meshes in the knee."""
     command.add_argument(
         *AXES_OPTIONS,
         dest="axes",

@@ -55,7 +55,6 @@ def all_settings() -> list[Setting]:
 
 
 def _instances(tree: ast.Module) -> Iterator[tuple[str, str]]:
-    """Yield the names of instance and class of each settings object at the top level."""
     for node in tree.body:
         if (
             isinstance(node, ast.Assign)

@@ -272,7 +272,6 @@ def _resume_hint(directory: Path) -> str:
 
 
 def _write(directory: Path, name: str, text: str, lines: list[str], figure: Any) -> None:
-    """Write a study's JSON, table and picture. Each file is complete or not written."""
     from tkamb.files import replaced_file, write_text
 
     write_text(directory / f"{name}.json", text + "\n")

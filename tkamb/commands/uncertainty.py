@@ -93,7 +93,6 @@ def _uncertainty(options: argparse.Namespace) -> int:
 
 
 def _screen(options: argparse.Namespace, overrides: dict[str, Any]) -> int:
-    """Print the effect of each input alone. Without --frames, only a few frames are computed."""
     from tqdm import tqdm
 
     from tkamb.io.scene import load_scene

@@ -91,12 +91,6 @@ def _view(options: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Check options and output files, before the runs are read.
-
-    Raises:
-        InputError: an option is invalid, or a file cannot be written.
-        ComputationError: --png is given, but there is no browser.
-    """
     check_port(options.port)
     if options.camera not in CAMERAS:
         hint = f"there are: {', '.join(CAMERAS)}"

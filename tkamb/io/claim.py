@@ -180,14 +180,12 @@ def _holding(lock: FileLock, path: Path) -> Iterator[None]:
 
 
 def _remove_temporaries(path: Path) -> None:
-    """Remove the temporary files of a killed process."""
     for entry in path.iterdir():
         if TEMPORARY.fullmatch(entry.name) and stat.S_ISREG(entry.lstat().st_mode):
             entry.unlink(missing_ok=True)
 
 
 def _check_ours(path: Path, force: bool) -> None:
-    """Raise an InputError if a folder holds files and none of them marks it as tkamb's own."""
     if force or is_ours(path):
         return
     others = sorted(entry.name for entry in path.iterdir())

@@ -164,7 +164,6 @@ def _check_name(entries: Mapping[str, Any], where: object) -> None:
 
 
 def _law(entries: Mapping[str, Any], base: Material | None, where: object) -> StressStrainLaw:
-    """Return the stress–strain law of the table, or else of the base."""
     name = entries.get("law")
     if name is not None and name not in LAW_KEYS:
         raise InputError(f"no law '{name}'", where, names_near(str(name), LAW_KEYS))

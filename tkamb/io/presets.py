@@ -157,7 +157,6 @@ class Preset:
 
 
 def _value_at(content: Mapping[str, Any], dotted: str) -> Any:
-    """Return the value of a dotted key; None if the key is absent."""
     value: Any = content
     for part in dotted.split("."):
         value = value.get(part) if isinstance(value, Mapping) else None
@@ -165,7 +164,6 @@ def _value_at(content: Mapping[str, Any], dotted: str) -> Any:
 
 
 def _put(content: dict[str, Any], dotted: str, value: Any) -> None:
-    """Set a dotted key, with new tables if needed; None removes the key."""
     *tables, last = dotted.split(".")
     for name in tables:
         if not isinstance(content.get(name), dict):

@@ -119,7 +119,6 @@ def _append_data(
 
 
 def _append(block: Element, name: str, values: NDArray) -> None:
-    """Append one array (n,) or (n, d), as float64, int64, int8 or uint8."""
     kind = values.dtype.str[1:]
     values = values if kind in TYPES else values.astype("<f8")
     array = SubElement(

@@ -84,7 +84,6 @@ class Deck:
 
     @property
     def _centre(self) -> int:
-        """Number of the node that moves the rigid patch."""
         return len(self.lattice.nodes) + 2 * len(self.patch.vertices) + 1
 
     def _mesh(self) -> list[str]:
@@ -315,7 +314,6 @@ def _course_and_output(root: Element) -> None:
 
 
 def _filled(parent: Element, tag: str, **values: object) -> Element:
-    """Return a new child of an element with one subelement per value."""
     element = SubElement(parent, tag)
     for name, value in values.items():
         SubElement(element, name).text = str(value)

@@ -287,7 +287,6 @@ def band_with_discrepancy(
 
 
 def _middles(count: int) -> Array:
-    """Return the centres of `count` equal parts of the interval 0 to 1."""
     return (np.arange(count) + 0.5) / count
 
 

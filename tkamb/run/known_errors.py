@@ -297,7 +297,6 @@ def short_error_words(error: Mapping[str, Any] | str, names: Iterable[str]) -> s
 
 
 def _listed(errors: Mapping[str, Any], names: Iterable[str]) -> str:
-    """Return errors in words, for example "5 % of the peak pressure and 3 % of the area"."""
     parts = [f"{100 * errors[name]:.2g} % of the {name.replace('_', ' ')}" for name in names]
     return " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
 

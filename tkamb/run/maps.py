@@ -421,7 +421,6 @@ def write_maps(maps: ContactMaps, path: Path) -> None:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """Open a contact.h5 of tkamb; raise an InputError for any other or damaged file."""
     with undamaged(path):
         try:
             file = h5py.File(path, "r")

@@ -192,7 +192,6 @@ class PressReport:
 
 
 def _naming_remarks(pair: ContactPair, pose: Array) -> list[str]:
-    """Return notes on poses for which the names medial and lateral are doubtful."""
     shape = orientation(pair.femoral, pose)
     remarks = []
     if shape is not None and shape.flexion < MIN_FLEXION:

@@ -142,7 +142,6 @@ def _method(case: Case, knee: Knee, split_sensitivity: bool, cam: "CamPost | Non
 
 
 def _patella_method(case: Case, knee: Knee, lines: "tuple[Ligament, ...]") -> "PatellaMethod":
-    """Return how the released patella of a case is found, with its ligaments' slack lengths."""
     from tkamb.knee.muscles import off_femur
     from tkamb.knee.patella_frame import HeadShare, PatellaMethod
 
@@ -229,7 +228,6 @@ def _knee(case: Case, shared: SharedState | None, contact: "KneeContact | None")
 
 
 def _check_near(case: Case, knee: Knee, poses: Array) -> None:
-    """Raise an InputError if no condyle is near the insert in the first, middle or last frame."""
     table = case.scene.contact
     if table is None or table.released:
         return
@@ -251,11 +249,6 @@ def _check_near(case: Case, knee: Knee, poses: Array) -> None:
 def _extensor_frames(
     case: Case, knee: Knee, poses: Array, shared: SharedState | None
 ) -> "ExtensorFrames":
-    """Return the patella of a case with [patella] in all frames.
-
-    Raises:
-        InputError: no patella was recorded, or `ExtensorFrames` raises one.
-    """
     from tkamb.knee.extensor import ExtensorFrames
 
     motion, recorded = case.motion, None

@@ -93,7 +93,6 @@ def compare_measured(
 
 
 def _frame_counts(predicted: Array, measured: Array, failed: NDArray[np.bool_]) -> dict[str, Any]:
-    """Return numbers of frames, and the range of the measured force in frames not compared."""
     compared = np.isfinite(predicted) & np.isfinite(measured)
     unmeasured = np.isnan(measured) & ~failed
     left_out = measured[np.isfinite(measured) & ~compared]

@@ -247,6 +247,5 @@ def frame_arrays(frame: Frame) -> dict[str, Array] | None:
 
 
 def _acting_at(point: Array, load: PointForces) -> PointForces:
-    """Return the equivalent load at a point (3,) of a load at the origin."""
     moment = load.moment - np.asarray(cross(point, load.forces[0]))
     return PointForces(load.link, point[None], load.forces, moment)

@@ -83,7 +83,6 @@ def read_results(directory: str | Path, *, check: bool = True) -> Results:
 
 
 def _read_maps(path: Path, frames: int) -> "ContactMaps | None":
-    """Return the maps of a file with at least some frames; None: no such file."""
     if not path.exists():
         return None
     from tkamb.run.maps import read_maps
@@ -194,13 +193,11 @@ def put_numbers(results: Results, files: Replacement) -> None:
 
 
 def _summary_hash(summary: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a summary without its key `summary_sha256`."""
     content = {key: value for key, value in summary.items() if key != "summary_sha256"}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def _plain(value: Any) -> Any:
-    """Return a value with numpy objects, paths and NaN converted to JSON types."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple | np.ndarray):
@@ -213,7 +210,6 @@ def _plain(value: Any) -> Any:
 
 
 def _put_maps(maps: "ContactMaps | None", name: str, files: Replacement) -> None:
-    """Write the maps unless they are the file of this name in the folder."""
     if maps is None:
         return
     if isinstance(maps.source, Path) and maps.source.absolute() == files.current(name).absolute():

@@ -247,8 +247,6 @@ def simulate(
 
 @dataclass(eq=False)
 class _Run:
-    """A run: computes the frames, records them and makes the results."""
-
     case: Case
     indices: range
     identity: dict[str, Any]
@@ -257,7 +255,6 @@ class _Run:
     start: float
 
     def prepare(self) -> None:
-        """Prepare body and contact. Errors of the input are raised here."""
         if self.case.scene.muscles:
             from tkamb.run.muscles.sharing import solver_is_installed, solver_missing
 
@@ -326,7 +323,6 @@ class _Run:
     def _finished(
         self, remaining: Sequence[int], progress: Progress, team: WorkerPool | None
     ) -> Iterator[Finished]:
-        """Yield the remaining frames in their order."""
         if team is None:
             yield from (self.solver.solve(k) for k in progress(remaining))
             return
@@ -352,11 +348,6 @@ class _Run:
 
 
 def _dotted(overrides: Mapping[str, Any], tables: Mapping[str, Any]) -> dict[str, Any]:
-    """Return dotted key -> value of all overrides.
-
-    Raises:
-        InputError: a keyword is no table of values, or a key is given twice.
-    """
     merged = dict(overrides)
     for name, table in tables.items():
         if not isinstance(table, Mapping):
@@ -379,7 +370,6 @@ def _scene_with(scene: Scene | Case, overrides: dict[str, Any]) -> Scene:
 def _scene_as(
     scene: Scene | Case, preset: str, model: str | None, resolution_mm: float | None
 ) -> Scene:
-    """Return the scene with a preset. Contact model and resolution take precedence if given."""
     if isinstance(scene, Case):
         raise InputError("a case has been read already", "preset", "give its scene instead")
     choices = {"contact.model": model, "contact.resolution_mm": resolution_mm}

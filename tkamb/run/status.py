@@ -189,7 +189,6 @@ def _lift_off(frame: "Frame", side: str) -> str:
 
 
 def _flank_flags(frame: "Frame") -> list[str]:
-    """Return a flag for each condyle with a contact normal far from the vertical."""
     result = []
     for side, condyle in frame.geometry.condyles.items():
         lean = float(np.arccos(np.clip(condyle.normal[1], -1.0, 1.0)))
@@ -222,7 +221,6 @@ def out_of_equilibrium(across: Array | float, normal: Array | float, body_weight
 
 
 def _patella_flags(case: "Case", frame: "Frame") -> list[str]:
-    """Return a flag if the recorded patella is not in equilibrium with its lines."""
     patella = case.scene.patella
     if patella is None or patella.motion != "recorded" or frame.loads.problems:
         return []

@@ -221,7 +221,6 @@ def notes_of(scene: Scene) -> list[str]:
 
 
 def _origin(case: Case, path: Path | None) -> dict[str, Any]:
-    """Return scene file, overrides, preset, time, command and versions of the run."""
     return {
         "scene": None if path is None else str(path.absolute()),
         "scene_sha256": scene_hash(case.scene),
@@ -234,7 +233,6 @@ def _origin(case: Case, path: Path | None) -> dict[str, Any]:
 
 
 def _subject(case: Case) -> dict[str, Any]:
-    """Return patient, frame, yield stress, axis of the plots and activity."""
     patient, output = case.scene.patient, case.scene.output
     words = "lateral (a left knee, computed as its mirror image)"
     lateral = words if patient.side == "left" else "right (lateral)"
@@ -301,7 +299,6 @@ def assumptions(case: Case) -> list[str]:
 
 
 def _marker_facts(case: Case) -> dict[str, Any]:
-    """Return coordinates, method and differences of skin markers."""
     markers = case.motion.markers
     assert markers is not None and case.scene.motion.markers is not None
     time = case.motion.time

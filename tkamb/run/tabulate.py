@@ -285,7 +285,6 @@ def _post_row(post: "PostContact") -> dict[str, float]:
 
 
 def _button_row(press: "ButtonPress | None") -> dict[str, float]:
-    """Return force, area, pressure and place of the button's contact; NaN without contact."""
     names = [each.name.removeprefix("button_") for each in COLUMNS if each.needs == BUTTON_NEEDS]
     values = dict.fromkeys(names, NAN)
     if press is not None:
@@ -313,7 +312,6 @@ def _button_row(press: "ButtonPress | None") -> dict[str, float]:
 
 
 def _patella_row(case: Case, found: "FoundPatella | None") -> dict[str, float]:
-    """Return coordinates and ligament tensions of the released patella; NaN: not found."""
     lost = found is None or bool(found.problem)
     balance = None if found is None or lost else found.balance
     places = np.full(6, NAN) if balance is None else balance.coordinates

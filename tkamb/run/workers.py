@@ -54,7 +54,6 @@ def check_cluster(address: str) -> None:
 
 
 def _library() -> Any:
-    """Return Dask's `distributed`, with the options that tkamb needs."""
     try:
         import dask
         import distributed

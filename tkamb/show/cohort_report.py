@@ -74,7 +74,6 @@ def cohort_html(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequenc
 def _designs(
     cohort: Cohort, groups: Sequence[Group], outcomes: Mapping[int, Outcome]
 ) -> dict[str, str] | None:
-    """Return the figure of pressure and wear of designs; None without designs or contact."""
     bars = design_bars(cohort, groups, outcomes)
     if not cohort.table.design or not any(bars.values()):
         return None
@@ -166,7 +165,6 @@ def _method_cards(cohort: Cohort, outcomes: Mapping[int, Outcome]) -> list[Card]
 
 
 def _wear_card(outcomes: Mapping[int, Outcome], groups: Sequence[Group]) -> Card:
-    """Return the range of the groups' worn volumes, with a caution on comparing designs."""
     lost = sum(bool(one.wear_problem) for one in outcomes.values())
     name = "volume_mm3_per_Mc"
     means = [float(np.nanmean(group.wear[name])) for group in groups if name in group.wear]
@@ -216,7 +214,6 @@ def _row(group: Group, names: Sequence[str]) -> list[str]:
 
 
 def _plots(groups: Sequence[Group]) -> Any:
-    """Yield the plots of each quantity and axis, with at most `AT_ONCE` groups in each."""
     for name in _there(groups):
         for axis in dict.fromkeys(group.axis for group in groups):
             drawn = [group for group in groups if group.axis == axis and name in group.bins]
@@ -286,7 +283,6 @@ def _draw_group(axes: Axes, group: Group, label: str, name: str, colour: str) ->
 def _maps(
     cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Group]
 ) -> dict[str, Any] | None:
-    """Return one map of each group side by side on one scale; None without contact."""
     shown, alike = _typical(cohort, outcomes, groups)
     with_map = shown[:MOST_MAPS]
     if not with_map:
@@ -341,7 +337,6 @@ def _typical(
 
 
 def _other_labels(cohort: Cohort, group: Group, number: int) -> tuple[str, ...]:
-    """Return the labels of a run that do not define its group."""
     return tuple(v for k, v in cohort.runs[number].labels.items() if k not in group.labels)
 
 

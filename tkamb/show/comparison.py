@@ -242,7 +242,6 @@ def _common_axis(paths: Sequence[Path], loaded: Sequence[Results]) -> str:
 
 
 def _labels(paths: Sequence[Path]) -> list[str]:
-    """Return the folders' names, with as many parent folders as make them unique."""
     parts = [path.resolve().parts for path in paths]
     for count in range(1, max(map(len, parts)) + 1):
         labels = ["/".join(part[-count:]) for part in parts]
@@ -288,7 +287,6 @@ def differences(first: Run, run: Run) -> list[Difference]:
 
 
 def _notes(runs: Sequence[Run]) -> list[str]:
-    """Return sentences on settings and columns that limit the comparison."""
     notes = []
     for key, words in SETTINGS.items():
         notes += _unlike(runs, words, [run.results.summary.get(key) for run in runs])
@@ -356,7 +354,6 @@ def _unlike(runs: Sequence[Run], words: str, values: Sequence[Any]) -> list[str]
 
 
 def _whole(value: Any) -> Any:
-    """Return a list of names as one sorted text."""
     return (", ".join(sorted(value)) or "nothing") if isinstance(value, list) else value
 
 

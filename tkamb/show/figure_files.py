@@ -38,7 +38,6 @@ def write_figures(results: "Results", folder: Path) -> list[str]:
 
 
 def _figures(results: "Results", axis: HorizontalAxis) -> Iterator[tuple[str, str, Figure]]:
-    """Yield name, title with unit, and figure of each plot. A figure is valid until the next."""
     drawn = [*panels(results), centre_panel(results)]
     if results.summary.get("muscle_groups"):
         from tkamb.show.muscles import muscle_panels

@@ -100,7 +100,6 @@ def cards(results: "Results", axis: HorizontalAxis) -> list[Card]:
 
 
 def _facts(results: "Results") -> dict[str, Any]:
-    """Return the numbers of `assets/headline.txt`."""
     summary = results.summary
     return {
         "questions": summary.get("questions") or [],
@@ -217,7 +216,6 @@ def _with_band(results: "Results", name: str, frame: int, scale: float, digits: 
 
 
 def _largest(table: Mapping[str, Any], result: str) -> str:
-    """Return the inputs with the largest shares of the variance of a result, in words."""
     shares = (table.get("shares_of_variance") or {}).get(result) or {}
     first = [(name, share) for name, share in shares.items() if name != "rest"][:MOST_INPUTS]
     return ", ".join(f"{_plain(name)} ({share:.0%})" for name, share in first if share >= 0.01)
@@ -228,7 +226,6 @@ def _plain(name: str) -> str:
 
 
 def _measured(results: "Results") -> tuple[str, str, bool] | None:
-    """Return the difference from the forces of an instrumented implant, with [measured]."""
     if not results.summary.get("measured"):
         return None
     from tkamb.run.recorded import comparison_words
@@ -280,7 +277,6 @@ def _peak_pressure(results: "Results") -> dict[str, Any] | None:
 
 
 def _post(results: "Results") -> dict[str, Any] | None:
-    """Return the peak force and pressure of the cam on the post; None: the post is not modelled."""
     peak = metrics.peak(results, "post_force_N") if "post_force_N" in results.columns else None
     if peak is None:
         return None

@@ -293,7 +293,6 @@ def _close_up(axes: Axes, one: LegFrame, view: View) -> None:
 
 
 def _same_limits(row: Array) -> None:
-    """Give all pictures of a row the same scale, so that the largest fits."""
     width = max(np.ptp(axes.get_xlim()) for axes in row)
     low = min(axes.get_ylim()[0] for axes in row)
     high = max(axes.get_ylim()[1] for axes in row)

@@ -188,7 +188,6 @@ def draw_activations(results: "Results", axis: HorizontalAxis) -> Figure | None:
 
 
 def _place_cells(cells: Sequence[Axes], rows: int) -> None:
-    """Place the small plots in rows, with room for the labels around them."""
     width, height = 72 * CELLS_ACROSS * CELL[0], 72 * (rows * CELL[1] + MARGIN)
     margin = EDGE_POINTS + TICK_POINTS + label_width(cells[0].yaxis)
     beyond = overhang(cells[0].xaxis, width / CELLS_ACROSS - margin)

@@ -265,7 +265,6 @@ def _areas(results: "Results") -> Panel:
 
 
 def _with_known_error(results: "Results", panel: Panel, names: tuple[str, ...]) -> Panel:
-    """Return the panel with the known error of its contact model."""
     error = results.summary.get("known_error")
     if error is None:
         return panel

@@ -265,7 +265,6 @@ def draw_paths(
 
 
 def _edge_length_mm(points: Array, triangles: NDArray[np.int64]) -> float:
-    """Return the median length of the triangles' edges, mm."""
     edges = points[triangles] - points[np.roll(triangles, 1, axis=1)]
     return float(np.median(np.linalg.norm(edges, axis=-1))) / MILLIMETRE
 
@@ -315,7 +314,6 @@ def _show(
     extent: tuple[float, float, float, float],
     height: float,
 ) -> None:
-    """Draw a picture (rows, columns, 4), one pixel per grid point. The page smooths it."""
     axes.imshow(picture, extent=extent, interpolation="none", zorder=height, clip_on=False)
 
 

@@ -164,7 +164,6 @@ def _maps(results: "Results", axis: HorizontalAxis, sheet: Sheet) -> dict[str, A
 
 
 def _button(results: "Results", axis: HorizontalAxis) -> str | None:
-    """Return the pictures of pressure on the patellar button; None without maps."""
     figure = draw_button_maps(results, axis)
     return None if figure is None else svg_text(figure, "button")
 
@@ -189,7 +188,6 @@ def _plot(panel: Panel, sheet: Sheet) -> dict[str, Any]:
 
 
 def _legend(results: "Results", axis: HorizontalAxis, computed: int) -> list[str]:
-    """Return the meaning of the marks in the plots of the shown frames."""
     sentences = [COLOURS]
     if len(results) < computed:
         sentences.append(
@@ -221,7 +219,6 @@ def _legend(results: "Results", axis: HorizontalAxis, computed: int) -> list[str
 
 
 def _sentences(summary: dict[str, Any]) -> list[str]:
-    """Return residuals, assumptions and parts not modelled, each once."""
     result: list[str] = []
     for key in ("residuals", "assumptions"):
         value = summary.get(key) or []
@@ -233,7 +230,6 @@ def _sentences(summary: dict[str, Any]) -> list[str]:
 
 
 def _provenance(summary: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return name and value, as text, of each key in `PROVENANCE`."""
     return [
         (key.replace("_", " ").replace("sha256", "SHA-256"), _text(summary[key]))
         for key in PROVENANCE
@@ -253,7 +249,6 @@ def _text(value: Any) -> str:
 
 
 def _cursor_data(results: "Results", axis: HorizontalAxis) -> dict[str, Any]:
-    """Return the data of the slider: position, status and values of all curves in each frame."""
     drawn = (*panels(results), centre_panel(results))
     if results.summary.get("muscle_groups"):
         from tkamb.show.muscles import muscle_panels

@@ -174,7 +174,6 @@ def _surface(surface: Surface) -> str:
 
 
 def _ligaments(recording: Recording) -> Entry:
-    """Return the bundles, the range of their strains, and the high strains with their flexion."""
     strains = recording.strains
     strained = [
         f"{name} {100 * value:.0f} % at {flexion:.0f} deg"
@@ -343,7 +342,6 @@ def check_scene(
 
 
 def _missing(case: Case) -> tuple[str, ...]:
-    """Return a message for each package that the run needs and that is not installed."""
     if not case.scene.muscles:
         return ()
     from tkamb.run.muscles.sharing import solver_is_installed, solver_missing

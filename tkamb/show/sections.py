@@ -178,7 +178,6 @@ def _positions(frames: Sequence[int], axis: HorizontalAxis) -> str:
 
 
 def _listed(stretches: list[str]) -> str:
-    """Return the stretches as text; of many, the first and their number."""
     more = len(stretches) - STRETCHES_SHOWN
     return ", ".join(stretches[:STRETCHES_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
@@ -270,7 +269,6 @@ def wear_section(results: "Results") -> dict[str, Any] | None:
 
 
 def _wear_content(wear: dict[str, Any], picture: str) -> dict[str, Any]:
-    """Return the section from the content of wear.json and its picture in base 64."""
     bands = wear["bands"] or {}
     return {
         "other": None,
@@ -324,7 +322,6 @@ def wear_of_run(results: "Results") -> dict[str, Any] | None:
 
 
 def _wear_legend(wear: dict[str, Any], bands: dict[str, Any]) -> str:
-    """Return the settings of the wear simulation and its varied inputs, in words."""
     words = (
         f"Law {wear['law']}, material {wear['material']}, {wear['control']} control, contact "
         f"{wear['contact']} at {wear['resolution_mm']:g} mm, {wear['blocks']} blocks of cycles; "

@@ -100,7 +100,6 @@ def design_bars(
 
 
 def _bar(cohort: Cohort, group: Group, values: Array, least: Array, most: Array) -> list[Bar]:
-    """Return a list with the bar of a group; it is empty if all values are NaN."""
     if not np.isfinite(values).any():
         return []
     place, series = _labels(cohort, group)

@@ -154,7 +154,6 @@ def _panel(axis: Axes, rows: Sequence[Row], labels: Sequence[str]) -> None:
 
 
 def _plain_ticks(axis: Axes) -> None:
-    """Label short logarithmic axes at 1, 2, 5, 10 and so on, also in panels that share them."""
     for side, (low, high) in ((axis.xaxis, axis.get_xlim()), (axis.yaxis, axis.get_ylim())):
         if high < SHORT_AXIS_RATIO * low:
             side.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

@@ -247,7 +247,6 @@ _ANALYTIC = {"sphere": _sphere, **dict.fromkeys(BICONDYLAR, _two_condyles)}
 
 
 def _shipped(name: str) -> StudyCase:
-    """Return a case of the shipped knee at the pose and load stored in `KNEE_CASES`."""
     from tkamb.geometry.flat_bottom import insert_placement
     from tkamb.io.recordings.meshes import load_surface
 

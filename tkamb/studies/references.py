@@ -91,7 +91,6 @@ def sphere_on_layer(
 def _indented(
     radius: float, thickness: float, contact: float, young: float, nu: float
 ) -> tuple[LayerContact, float]:
-    """Return the contact with a given contact radius, m, and its load, N."""
     angle = np.linspace(0.0, np.pi / 2, RINGS + 1)
     edges, middles = contact * np.sin(angle), contact * np.sin((angle[1:] + angle[:-1]) / 2)
     disk = _disks(middles, edges[1:], thickness, young, nu)

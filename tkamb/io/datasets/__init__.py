@@ -162,12 +162,6 @@ def take_from(dataset: Dataset, to: Path, folder: Path) -> Got:
 
 
 def _get(dataset: Dataset, to: Path, fetch: Callable[[DataFile, Path], Path | None]) -> Got:
-    """Write the missing files of a data set.
-
-    Args:
-        dataset: the data set.
-        fetch: function of a file and a temporary folder, which returns the path of a copy or None.
-    """
     missing = [file for file in dataset.files if not _is_there(file, to)]
     got = Got(kept=[file.name for file in dataset.files if file not in missing])
     for file in missing:
@@ -210,7 +204,6 @@ def _retrieved(address: str, file: DataFile, folder: Path) -> Path:
 
 
 def _verified_copy(file: DataFile, folder: Path) -> Path | None:
-    """Return the path of a file in a folder of downloads, or None."""
     copies = [place for place in file.places(folder) if place.is_file()]
     for place in copies:
         if sha256_of(place) == file.sha256:

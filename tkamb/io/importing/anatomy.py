@@ -254,12 +254,10 @@ def _rigid_groups(model: OpenSimModel) -> dict[str, set[str]]:
 
 
 def _ordered(model: OpenSimModel, group: set[str], stem: str) -> tuple[str, ...]:
-    """Return the bodies by mass; those with the stem in their name come first."""
     return tuple(sorted(group, key=lambda b: (stem not in b.lower(), -model.bodies[b].mass_kg, b)))
 
 
 def _carried(model: OpenSimModel, body: str) -> list[str]:
-    """Return a body and all bodies that follow it in the tree from ground."""
     result = [body]
     for joint in model.joints:  # from ground outwards
         if joint.inboard in result:

@@ -48,7 +48,6 @@ def with_external_loads(request: ImportRequest, foot: tuple[str, ...]) -> Import
 
 
 def _columns_of(force: ExternalForce, columns: list[TableForce], path: Path) -> TableForce:
-    """Return the force of the table whose columns are those of the list."""
     for candidate in columns:
         if all(
             name.startswith(force.beginnings[kind])

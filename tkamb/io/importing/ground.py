@@ -215,7 +215,6 @@ def _which_foot(forces: list[TableForce], side: str, table: Table) -> InputError
 
 
 def _recorded(table: Table, force: TableForce, axes: str) -> RecordedForce:
-    """Return a force of a table, in the axes of the laboratory."""
     columns = {"time": "time", **force.columns}
     source = GroundReactionTable(
         file=table.path,
@@ -247,7 +246,6 @@ def _table_file(
 
 
 def _summed(recorded: list[RecordedForce], path: Path) -> str:
-    """Return a table of the summed forces as CSV. A force below the load threshold is zero."""
     time = recorded[0].time
     levels = [force.level for force in recorded]
     wrenches = []

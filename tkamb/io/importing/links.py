@@ -245,7 +245,6 @@ def _patella(
     with_button: bool,
     remarks: list[str],
 ) -> tuple[Array | None, Array | None, float]:
-    """Return `patella`, `button_in_patella` and `patella_error` of `Links`."""
     if leg.patella is None:
         return None, None, 0.0
     anatomical = leg.neutral[leg.patella][:3, :3].T @ (leg.neutral[leg.femur[0]] @ femur)[:3, :3]
@@ -337,7 +336,6 @@ def _chain(
     first: Array,
     side: str,
 ) -> list[str]:
-    """Return the URDF lines of a series of one-axis joints with massless links between them."""
     lines, parent = [], start
     for number, (name, (kind, axis)) in enumerate(joints.items(), 1):
         # In a left knee the rotation axes x and y have the opposite sign (docs/patient.md).

@@ -126,7 +126,6 @@ def placed_markers(links: Links, points: Mapping[str, Mapping[str, Array]]) -> O
 
 
 def _bodies(leg: Leg) -> tuple[tuple[str, tuple[str, ...], str], ...]:
-    """Return name, bodies and neighbour of each segment."""
     return (
         ("shank", leg.tibia, ""),
         ("thigh", leg.femur, ""),
@@ -136,7 +135,6 @@ def _bodies(leg: Leg) -> tuple[tuple[str, tuple[str, ...], str], ...]:
 
 
 def _seen_labels(recorded: Table, without: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return the labels of markers that are visible in any frame, and the labels to leave out."""
     labels = recorded_labels(recorded)
     dropped = matched_labels(without, labels)
     if unknown := [name for name in without if name not in dropped]:
@@ -162,7 +160,6 @@ def segments_of(recorded: Table, segments: list[ModelSegment]) -> list[ModelSegm
 
 
 def _equal_line(recorded: Table) -> str:
-    """Return words on the labels that occur twice and are therefore ignored, or ""."""
     names = list(dict.fromkeys(column[:-2] for column in recorded.equal))
     listed = ", ".join(names)
     return f"; labels that occur twice are ignored ({listed}): rename one of each" if names else ""
@@ -260,7 +257,6 @@ def facing(segments: list[ModelSegment], recorded: Table) -> Facing:
 
 
 def _nearest_axis(vector: Array) -> tuple[Array, float]:
-    """Return the signed axis nearest to a vector (3,), and the angle (deg) between them."""
     k = int(np.argmax(np.abs(vector)))
     axis = np.zeros(3)
     axis[k] = np.sign(vector[k])

@@ -235,15 +235,6 @@ def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[st
 
 
 def _gait_lines(case: Case, asks_gait: bool) -> tuple[str, ...]:
-    """Return a line on the foot strikes and toe-offs on the force plates, or no line without any.
-
-    Args:
-        case: the loaded scene.
-        asks_gait: whether the plates must show a gait cycle.
-
-    Raises:
-        InputError: the plates do not show the required gait cycle.
-    """
     gait = None if case.ground is None else case.ground.gait
     if asks_gait and case.gait_cycle_s is None:
         raise InputError(
@@ -264,11 +255,6 @@ def _gait_lines(case: Case, asks_gait: bool) -> tuple[str, ...]:
 
 
 def _same_there(path: Path, text: str) -> bool:
-    """Return whether the path is a file with this content.
-
-    Raises:
-        InputError: the path exists with another content, or is not a file.
-    """
     if not os.path.lexists(path):
         return False
     with suppress(InputError):

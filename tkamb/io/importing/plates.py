@@ -57,11 +57,6 @@ class TableForce:
 
 @dataclass(frozen=True)
 class _Column:
-    """The parts of a column's name.
-
-    `stem` is the name of the column's force; `owner` is this name without words like "ground".
-    """
-
     name: str
     kind: str
     axis: int
@@ -111,7 +106,6 @@ def table_forces(table: Table) -> list[TableForce]:
 
 
 def _refuse_unassigned(table: Table, unassigned: list[_Column], forces: list[TableForce]) -> None:
-    """Raise an InputError if a moment column belongs to no force and a force has no moment."""
     read = {name for force in forces for name in force.columns.values()}
     others = [
         name
@@ -452,6 +446,5 @@ def _middle(table: Table, labels: list[str]) -> Array:
 
 
 def _interpolated(values: Array, time: Array, at: Array) -> Array:
-    """Return values (n, 3) at other times; NaN outside the recording."""
     columns = [np.interp(at, time, values[:, k], left=np.nan, right=np.nan) for k in range(3)]
     return np.stack(columns, axis=1)

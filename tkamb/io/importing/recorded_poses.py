@@ -119,15 +119,6 @@ def _joint_centres(
 def _centre_lines(
     name: str, markers: Mapping[str, Array], centre: Array, tibia: Array
 ) -> list[str]:
-    """Return the lines of a table [[tibia.joint_centre]].
-
-    Args:
-        name: name of the joint centre.
-        markers: label of a marker of the neighbouring segment -> its position in the segment's
-            frame, m, shape (3,).
-        centre: the joint centre in the same frame, m, shape (3,).
-        tibia: the joint centre in the tibia link, m, shape (3,).
-    """
     return [
         "[[tibia.joint_centre]]",
         f"name = {toml_value(name)}",

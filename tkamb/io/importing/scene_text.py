@@ -361,7 +361,6 @@ _ALL = ["flexion", "adduction", "axial_rotation", "ap", "si", "ml"]
 
 
 def _end(key: str, end: End) -> str:
-    """Return the line for one end of a muscle or ligament."""
     return f"{key} = {{ link = {toml_value(end.link)}, point_mm = {toml_mm(end.point)} }}"
 
 

@@ -72,7 +72,6 @@ def _end(point: PathPoint) -> End:
 
 
 def _fixed(path: Path, bodies: tuple[str, ...]) -> list[PathPoint]:
-    """Return the points of a path that are always active and fixed to one of the bodies."""
     return [p for p in path.points if type(p) is PathPoint and p.body in bodies]
 
 
@@ -211,7 +210,6 @@ def _omission_reason(ligament: OpenSimLigament, fixed: int) -> str:
 
 
 def _name_muscles(links: Links, remarks: list[str]) -> None:
-    """Add a remark on the muscles across the knee that act only with the table [muscles]."""
     leg = links.leg
     across = [
         muscle.name

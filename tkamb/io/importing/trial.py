@@ -304,7 +304,6 @@ def _thinned(
 
 
 def _check_within(time: Array, start: float, end: float) -> None:
-    """Raise an InputError if an interval exceeds the recording by more than one frame."""
     frame = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
     if start < time[0] - frame or end > time[-1] + frame:
         raise InputError(

@@ -302,7 +302,6 @@ def _lenient(content: bytes) -> tuple[str, list[str]]:
 
 
 def _include(element: Element, path: Path, opened: tuple[Path, ...], notices: list[str]) -> None:
-    """Replace, in place, every element with a `file` attribute by the content of that file."""
     while (name := element.attrib.pop("file", "").strip()) and name.lower() != "unassigned":
         path, opened = _replace(element, name, path, opened, notices)
     for child in element:
@@ -344,7 +343,6 @@ def _replace(
 
 
 def _apply_defaults(target: Element, defaults: Element | None) -> None:
-    """Add a file's defaults to its elements, because the defaults do not apply to other files."""
     by_tag = {} if defaults is None else {entry.tag: entry for entry in defaults}
     inside = set() if defaults is None else set(defaults.iter())
     for element in [e for e in target.iter() if e.tag in by_tag and e not in inside]:

@@ -91,7 +91,6 @@ class Kinematics:
         self._index_joints(model)
 
     def _index_joints(self, model: OpenSimModel) -> None:
-        """Store the joint, rank and sign of each axis, and the frames of each joint."""
         joints = model.joints
         self._ends = [(self.bodies[j.inboard], self.bodies[j.outboard]) for j in joints]
         self._backwards = np.array([j.backwards for j in joints], bool).reshape(-1, 1, 1)

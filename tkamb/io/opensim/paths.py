@@ -137,7 +137,6 @@ class LineSet:
             yield first, flat[first : first + BLOCK_FRAMES]
 
     def _joined(self, q: Array, *columns: Sequence[Array]) -> list[Array]:
-        """Join blocks (f, m, ...) to arrays with the leading shape of q."""
         arrays = [np.concatenate(parts) for parts in columns]
         return [values.reshape(*q.shape[:-1], *values.shape[1:]) for values in arrays]
 

@@ -151,7 +151,6 @@ def _least_turn(up: Array) -> Array:
 
 
 def _check_metres(document: Document, model: Element, joints: list[Joint]) -> None:
-    """Raise an InputError if a file without a unit of length has lengths that no body has."""
     word = (model.findtext("length_units") or "").strip()
     if word.lower() not in NO_UNIT:
         return
@@ -277,7 +276,6 @@ def _constraints(
 def _check_follower(
     document: Document, element: Element, new: CoordinateCoupler, others: list[CoordinateCoupler]
 ) -> None:
-    """Raise an InputError if a coordinate would depend on two coordinates or on itself."""
     leads = {coupler.dependent: coupler.independent for coupler in others}
     if new.dependent in leads:
         raise InputError(
@@ -291,7 +289,6 @@ def _check_follower(
 
 
 def _followers_last(couplers: list[CoordinateCoupler]) -> tuple[CoordinateCoupler, ...]:
-    """Return the couplers, ordered so that each coordinate is set before others depend on it."""
     ordered: list[CoordinateCoupler] = []
     remaining = list(couplers)
     while remaining:

@@ -119,7 +119,6 @@ class Frames:
 
 
 def _held_frames(element: Element, owner: str) -> Iterator[tuple[str, Element]]:
-    """Yield, for every frame, the name of the owning body, joint or frame, and the element."""
     for child in element:
         if child.tag in FRAMES:
             yield owner, child
@@ -128,7 +127,6 @@ def _held_frames(element: Element, owner: str) -> Iterator[tuple[str, Element]]:
 
 
 def _stations(document: Document, model: Element) -> dict[str, list[Element]]:
-    """Return name -> all stations and markers with this name in the model."""
     result: dict[str, list[Element]] = {}
     for element in model.iter():
         if element.tag in ("Station", "Marker"):
@@ -231,7 +229,6 @@ def _joint(
 
 
 def _joint_elements(document: Document, model: Element) -> Iterator[tuple[Element, str | None]]:
-    """Yield each joint, and the name of its child body (old layout) or None (OpenSim 4)."""
     for element in document.objects(model, "JointSet"):
         yield element, None
     for body in document.objects(model, "BodySet"):
@@ -282,7 +279,6 @@ def _standard_axes(
 def _custom_axes(
     document: Document, element: Element, names: list[str]
 ) -> tuple[tuple[JointAxis, ...], tuple[JointAxis, ...]]:
-    """Return the rotation and translation axes of a <SpatialTransform> that have an effect."""
     kinds: dict[str, list[JointAxis]] = {"rotation": [], "translation": []}
     transform_element = document.find(element, "SpatialTransform")
     if transform_element is None:

@@ -65,7 +65,6 @@ def read_wrap_objects(document: Document, model: Element, frames: Frames) -> dic
 
 
 def _wrap_object(document: Document, entry: Element, body: str, in_body: Array) -> WrapObject:
-    """Return a wrap object, from the pose (4, 4) in the body of the frame that holds it."""
     if entry.tag not in SHAPES:
         raise InputError("is a wrap object that is not read", document.where(entry))
     shape, tags = SHAPES[entry.tag]
@@ -187,8 +186,6 @@ def _ligament(document: Document, element: Element, path: Path) -> OpenSimLigame
 
 
 class _PathReader:
-    """Reader of muscle and ligament paths."""
-
     def __init__(
         self,
         document: Document,
@@ -200,11 +197,6 @@ class _PathReader:
         self.coordinates, self.wraps = coordinates, wraps
 
     def path(self, element: Element) -> Path:
-        """Return the path of a force.
-
-        Raises:
-            InputError: the path has fewer than two points, or an element that cannot be read.
-        """
         document = self.document
         geometry = document.find(element, "GeometryPath")
         if geometry is None:
@@ -254,7 +246,6 @@ class _PathReader:
         return MovingPathPoint(entry.get("name", ""), body, tuple(coordinates), tuple(functions))
 
     def _coordinate(self, entry: Element, name: str, *, where: str) -> str | None:
-        """Return the name of the coordinate of a socket; None if the socket is empty."""
         socket = self.document.socket(entry, name, name, default=" ").strip()
         name = socket.split("/")[-1]
         if name and name not in self.coordinates:

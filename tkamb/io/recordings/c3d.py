@@ -165,7 +165,6 @@ def read_c3d(path: str | Path, units: GivenUnits | None = None) -> Recording:
 
 @lru_cache(maxsize=2)
 def _read(path: Path, changed: int, units: GivenUnits) -> Recording:
-    """Read a file. `changed`, the time of its last change in ns, is part of the cache's key."""
     with np.errstate(all="ignore"):  # damaged numbers overflow; they become gaps
         file = parse_c3d(read_bytes(path, TABLE_BYTES), path)
         return _Reader(path, file, units).recording()
@@ -173,8 +172,6 @@ def _read(path: Path, changed: int, units: GivenUnits) -> Recording:
 
 @dataclass(frozen=True, eq=False)
 class _Reader:
-    """Reader of the parts of a recording. `faults` has the errors of unreadable parts."""
-
     path: Path
     file: C3dFile
     units: GivenUnits
@@ -217,7 +214,6 @@ class _Reader:
         )
 
     def _rate(self) -> float:
-        """Return frames per second from POINT:RATE, else from the header."""
         stated = self._parameters.number("POINT:RATE")
         rates = [stated, self.file.header.rate_Hz]
         for rate in rates:
@@ -421,7 +417,6 @@ def no_length_unit(word: str, path: Path) -> InputError:
 
 
 def _check_rates(analog_rate: float | None, rate: float, samples: int, path: Path) -> None:
-    """Raise unless the stated rates agree with the number of analog samples per frame."""
     if analog_rate is None or analog_rate == 0:
         return  # the number of samples per frame gives the rate
     ratio = analog_rate / rate

@@ -245,7 +245,6 @@ def _text(content: bytes) -> str:
 
 
 def _value(record: bytes, machine: int) -> Any:
-    """Return the values of a parameter's record; None if the record is damaged."""
     if len(record) < 2:
         return None
     kind, dimensions = int(np.frombuffer(record, "i1", 1)[0]), record[1]
@@ -348,7 +347,6 @@ def _disagreement(header: Header, parameters: Parameters, path: Path) -> InputEr
 
 
 def _check_scale(header: Header, parameters: Parameters, path: Path) -> None:
-    """Raise if the markers have no scale, or two."""
     if not math.isfinite(header.scale) or (header.scale == 0 and header.markers):
         raise InputError(f"has a scale of {header.scale:g} for its markers", path, EXPORT)
     scale = parameters.number("POINT:SCALE")
@@ -361,8 +359,6 @@ def _check_scale(header: Header, parameters: Parameters, path: Path) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Data:
-    """Reader of the data section."""
-
     content: bytes
     header: Header
     parameters: Parameters
@@ -375,17 +371,14 @@ class _Data:
 
     @property
     def _frame(self) -> int:
-        """Bytes of a frame."""
         return (4 * self.header.markers + self.header.analog) * self._word
 
     def fits(self) -> bool:
-        """Return whether the frames, from a stated block, end within the file's last block."""
         stated = [self.header.data_block, *self.parameters.integers("POINT:DATA_START")[:1]]
         blocks = [block for block in stated if block > self.content[0]]
         return self._frame > 0 and any(self._fits((block - 1) * BLOCK) for block in blocks)
 
     def read(self, notices: list[str]) -> C3dFile:
-        """Return the file with its frames. `notices` are those of the header."""
         if not self._frame:
             raise self._empty()
         start = self._start(notices)
@@ -441,7 +434,6 @@ class _Data:
         return (chosen - 1) * BLOCK
 
     def _fits(self, start: int) -> bool:
-        """Return whether the frames, from byte `start`, end within the last block of the file."""
         spare = len(self.content) - start - self._stated() * self._frame
         return 0 <= spare < BLOCK
 

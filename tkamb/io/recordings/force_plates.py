@@ -211,7 +211,6 @@ def _above_transducers(record: PlateRecord) -> Array:
 
 
 def _stated_length(record: PlateRecord) -> float:
-    """Return the metres that stand for the length in moments, points (type 1) or ORIGIN (3)."""
     if record.kind == 3:
         return record.metres_per_unit
     if record.kind in _CALIBRATED:
@@ -318,7 +317,6 @@ def _axes(corners: Array, where: str) -> Array:
 
 
 def _stated_scales(record: PlateRecord) -> Array | None:
-    """Return the factors (6,) from the channels' units to N and N·m; None: a unit is unknown."""
     readers = (newtons,) * 3 + (newton_metres,) * 3
     result = [read(unit) for read, unit in zip(readers, record.units, strict=False)]
     return None if None in result or len(result) < 6 else np.array(result, float)
@@ -333,7 +331,6 @@ def _given_moment(record: PlateRecord) -> float:
 
 
 def _scales(record: PlateRecord) -> Array:
-    """Return the factor (c,) from the unit of each channel to N, N·m or m."""
     kinds = {1: "fffllm", 3: "ffffffff"}.get(record.kind, "fffmmm")
     readers = {"f": newtons, "m": newton_metres, "l": metres}
     keys = {"f": "force_unit", "m": "moment_unit", "l": "length_unit"}

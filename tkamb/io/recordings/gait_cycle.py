@@ -104,7 +104,6 @@ def uninterrupted_runs(chosen: Mask) -> list[tuple[int, int]]:
 
 
 def _crossing(time: Array, vertical: Array, after: int) -> float:
-    """Return the time (s) at which the force crosses the threshold before sample `after`."""
     low, high = vertical[after - 1], vertical[after]
     share = (CONTACT_FORCE_N - low) / (high - low) if high != low else 1.0
     share = float(np.clip(share, 0.0, 1.0))

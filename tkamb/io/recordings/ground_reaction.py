@@ -219,11 +219,6 @@ def _units(source: GroundReactionTable) -> GivenUnits:
 def _complete_part(
     recorded: RecordedReaction, time: Array, source: GroundReactionTable
 ) -> RecordedReaction:
-    """Return the longest part around the frames with only finite values.
-
-    Raises:
-        InputError: a value among the frames is not finite.
-    """
     values = np.concatenate([recorded.force, recorded.moment], axis=1)
     gaps: NDArray[np.bool_] = np.asarray(~np.isfinite(values).all(axis=1))
     if not gaps.any():
@@ -329,7 +324,6 @@ def _upright_point(source: GroundReactionTable) -> str:
 
 
 def _read_columns(source: GroundReactionTable, recorded: Table) -> tuple[Array, Array, Array]:
-    """Return force (N), point (m) and moment about it (N·m), each (n, 3), in the laboratory."""
     roles = [f"{kind}_{k}" for kind in ("force", "point", "moment") for k in (1, 2, 3)]
     check_roles(source.columns, ("time", *roles), recorded.path, "ground_reaction")
     rotation = laboratory_rotation(source.laboratory_axes, recorded.path)
@@ -358,7 +352,6 @@ def _read_columns(source: GroundReactionTable, recorded: Table) -> tuple[Array, 
 
 
 def _check_size(path: Path, kind: str, column: str, values: Array) -> None:
-    """Raise an InputError if a column (n,) holds larger values than a foot exerts."""
     largest, unit = LARGEST[kind]
     hint = f"check whether a cell is mistyped, and whether the {kind} is in {unit}"
     filled = np.where(np.isfinite(values), values, 0.0)  # gaps are checked later
@@ -444,7 +437,6 @@ def _centre_of_pressure(force: Array, about_origin: Array, level: float) -> Arra
 
 
 def _check_upward(force: Array, source: GroundReactionTable) -> None:
-    """Raise an InputError if the largest force on the foot points down or sideways."""
     up, down = float(force[:, 1].max()), float(-force[:, 1].min())
     aside = float(np.hypot(force[:, 0], force[:, 2]).max())
     if max(down, aside) > max(up, source.unloaded_N):
@@ -460,7 +452,6 @@ def _check_upward(force: Array, source: GroundReactionTable) -> None:
 
 
 def _interpolate_unloaded(stamps: Array, point: Array, loaded: np.ndarray, path: Path) -> Array:
-    """Return the points (k, 3) m, interpolated in time while the plate is unloaded."""
     missing = loaded & ~np.isfinite(point).all(axis=1)
     if missing.any():
         raise InputError(

@@ -381,7 +381,6 @@ def _displaced(poses: Array, step: Array) -> Array:
 
 
 def _fill_gaps(poses: Array) -> Array:
-    """Return poses (f, 4, 4); a gap has the last pose before it, or else the first known pose."""
     finite = np.flatnonzero(np.isfinite(poses[:, 0, 3]))
     if not len(finite):
         return np.tile(np.eye(4), (len(poses), 1, 1))

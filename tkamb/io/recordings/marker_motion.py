@@ -210,7 +210,6 @@ def _check_fits(rms: dict[str, Array], recorded: Table) -> None:
 
 
 def _check_joints(segments: list[Segment], poses: dict[str, Array], recorded: Table) -> None:
-    """Raise an InputError if two segments' markers give distant positions of their joint."""
     for segment in segments:
         name, neighbour = segment.name, segment.joined_to
         if segment.joint is None or segment.centre is None:
@@ -279,10 +278,6 @@ def _knee(insert: Array, femur: Array) -> Array:
 def _run(
     time: Array, missing: np.ndarray, interval: tuple[float, float] | None, recorded: Table
 ) -> slice:
-    """Return the longest range of frames around the interval without a missing frame.
-
-    Without an interval, no frame of the recording may be missing.
-    """
     start, end = interval or (time[0], time[-1])
     if start < time[0] - 1e-9 or end > time[-1] + 1e-9:
         raise InputError(

@@ -171,7 +171,6 @@ def fit_seen(points: Array, reference: Array, weights: Array, name: str) -> tupl
 
 
 def _spans(reference: Array) -> bool:
-    """Return whether points (m, 3) span a triangle."""
     centred = reference - reference.mean(axis=0) if len(reference) else reference
     return len(reference) >= 3 and bool(np.linalg.svd(centred, compute_uv=False)[1] >= 1e-3)
 

@@ -222,7 +222,6 @@ def check_mesh(path: str | Path) -> MeshHealth:
 
 
 def _roughness(mended: Repair, units: list[str]) -> tuple[str, ...]:
-    """Return the spikes, noise and steps of a mesh in words; openings have lines of their own."""
     if not units or not len(mended.faces):
         return ()
     words = mesh_words(Surface(mended.vertices, mended.faces, merged=True))

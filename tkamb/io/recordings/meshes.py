@@ -184,7 +184,6 @@ def check_same_space(first: str | Path, second: str | Path) -> None:
 
 
 def _check_space(path: str | Path, axes: str) -> None:
-    """Raise an InputError if the axes contradict the space that the file names."""
     space = space_of(path)
     if space is not None and not np.array_equal(axes_rotation(axes), axes_rotation(SPACES[space])):
         raise InputError(
@@ -218,7 +217,6 @@ def read_triangles(path: str | Path) -> tuple[Array, Indices]:
 
 
 def _read_mesh(path: Path) -> tuple[Array, Indices]:
-    """Return vertices and triangles of a mesh file. Polygons are cut into triangles."""
     try:
         check_file(path, MESH_BYTES, what="mesh file")
         suffix = path.suffix.lower()
@@ -238,7 +236,6 @@ def _read_mesh(path: Path) -> tuple[Array, Indices]:
 
 
 def _read_by_trimesh(path: Path) -> tuple[Array, Indices]:
-    """Return vertices and triangles of a text STL file, or of another format."""
     import trimesh  # takes 0.25 s; most meshes do not need it
 
     mesh = trimesh.load(path, force="mesh", process=False)
@@ -400,7 +397,6 @@ def _check_size(
 
 
 def _check_knee_width(surface: Surface, path: str | Path) -> None:
-    """Raise an InputError if a component with two condyles is smaller than any person's knee."""
     extents = np.ptp(surface.bounds, axis=0)
     if extents.max() < MIN_SIZE and condyle_split(surface) is not None:
         raise InputError(

@@ -183,11 +183,6 @@ def _from_markers(
 def _find_unrecorded(
     recorded: Table, source: MotionTable, released: Sequence[str]
 ) -> tuple[str, ...]:
-    """Return the coordinates without a column.
-
-    Raises:
-        InputError: such a coordinate is not released.
-    """
     missing = [
         role
         for role in KNEE_COORDINATES
@@ -240,7 +235,6 @@ def _check_roles(source: MotionTable, recorded: Table) -> None:
 
 
 def _turn_signs(recorded: Table, source: MotionTable) -> Table:
-    """Return the recording with the columns of the roles in `signs_turned` negated."""
     names = {source.columns.get(role, role) for role in source.signs_turned}
     negated = {name: -recorded.column(name) for name in names}
     return replace(recorded, columns=recorded.columns | negated)
@@ -258,10 +252,6 @@ def _bending_role(recorded: Table, source: MotionTable) -> str:
 
 
 def _check_knee(knee: Array, path: Path, bending: str | None = None) -> None:
-    """Raise an InputError if knee coordinates (n, 6) are impossible.
-
-    `bending` is the role of the column that shows flexion, or None.
-    """
     for i, name in enumerate(KNEE_COORDINATES):
         if name in LIMITS_DEG:
             hint = "check [motion] columns, sequence, angle_unit and the meshes' axes"

@@ -166,7 +166,6 @@ def _parse(path: Path) -> ElementTree.Element:
 
 
 def _origin(element: ElementTree.Element) -> Array:
-    """Return the 4x4 pose of the <origin> of a joint or inertial."""
     origin = element.find("origin")
     rotation = Rotation.from_euler("xyz", numbers_of(origin, "rpy")).as_matrix()
     return pose(rotation, numbers_of(origin, "xyz"))

@@ -100,11 +100,6 @@ def read_ply(path: str | Path) -> Polygons:
 
 
 def _checked(vertices: object, corners: object, ends: object) -> Polygons:
-    """Return vertices, corners and ends of polygons as arrays.
-
-    Raises:
-        ValueError: a polygon has a corner that is no vertex.
-    """
     points = np.asarray(vertices, np.float64).reshape(-1, 3)
     index = np.asarray(corners).astype(np.int64)
     if len(index) and not (index.min() >= 0 and index.max() < len(points)):
@@ -113,7 +108,6 @@ def _checked(vertices: object, corners: object, ends: object) -> Polygons:
 
 
 def _ply_header(content: bytes) -> tuple[str, list[_Element], int]:
-    """Return the byte order ("" for text), the elements, and the first byte of the data."""
     if not content.startswith(b"ply"):
         raise ValueError("it does not begin with 'ply'")
     order, elements, position = None, list[_Element](), 0
@@ -154,7 +148,6 @@ def _columns_to_read(element: _Element) -> list[int]:
 def _ply_text(
     content: bytes, start: int, elements: list[_Element], order: str
 ) -> Iterator[tuple[str, tuple[Array, Index]]]:
-    """Yield the name of each element of a text file, its values, and where each item ends."""
     lines = iter(content[start:].decode("latin-1").splitlines())
     for element in elements:
         columns, values, ends = _columns_to_read(element), list[float](), list[int]()
@@ -181,7 +174,6 @@ def _ply_text(
 def _ply_binary(
     content: bytes, start: int, elements: list[_Element], order: str
 ) -> Iterator[tuple[str, tuple[Array, Index]]]:
-    """Yield the name of each element of a binary file, its values, and where each item ends."""
     for element in elements:
         columns, position = _columns_to_read(element), start
         if element.name == "vertex" and len(columns) < 3:
@@ -202,7 +194,6 @@ def _ply_binary(
 def _equal_rows(
     content: bytes, start: int, element: _Element, order: str
 ) -> tuple[NDArray | None, int]:
-    """Return an element's rows and where they end; None if its lists differ in length."""
     fields: list[tuple[Any, ...]] = []
     position = start
     for n, (_, kind, length) in enumerate(element.properties):
@@ -231,7 +222,6 @@ def _equal_rows(
 def _uneven_rows(
     content: bytes, start: int, element: _Element, order: str, columns: list[int]
 ) -> tuple[Array, Index, int]:
-    """Return an element's values, where each item ends, and where the element ends in the file."""
     kinds = [
         (np.dtype(order + kind), np.dtype(order + length) if length else None)
         for _, kind, length in element.properties
@@ -308,7 +298,6 @@ def _is_text(content: bytes) -> bool:
 
 
 def _another_solid(content: bytes, position: int) -> bool:
-    """Return whether another complete solid with finite corners begins at a byte."""
     available = len(content) - position - _HEADER
     if available < _TRIANGLE.itemsize:
         return False
@@ -320,7 +309,6 @@ def _another_solid(content: bytes, position: int) -> bool:
 
 
 def _refuse_cut_short(content: bytes, path: Path) -> None:
-    """Raise an InputError if a file has plausible triangles, but fewer than it states."""
     count = int.from_bytes(content[80:_HEADER], "little")
     stored = (len(content) - _HEADER) // _TRIANGLE.itemsize
     if not 0 < stored < count:

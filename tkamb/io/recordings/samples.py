@@ -84,7 +84,6 @@ def neighbours_curve(time: Array, values: Array) -> Array:
 
 
 def _running_median(away: Array) -> Array:
-    """Return the running median (n,) of the deviations."""
     width = min(2 * NEIGHBOURS + 1, len(away))
     windows = np.lib.stride_tricks.sliding_window_view(away, width)
     start = np.clip(np.arange(len(away)) - width // 2, 0, len(windows) - 1)

@@ -313,7 +313,6 @@ def _trc_cells(line: str) -> list[str]:
 
 
 def _filled(cells: list[str]) -> int:
-    """Return the number of cells without empty cells at the end."""
     return max((k for k, cell in enumerate(cells, 1) if cell), default=0)
 
 
@@ -393,7 +392,6 @@ def _exact_time(time: Array, frame: Array, rate: str) -> Array:
 def _columns(
     path: Path, names: list[str], rows: list[tuple[int, list[str]]]
 ) -> tuple[dict[str, Array], tuple[str, ...]]:
-    """Return name -> values (n,), and the names that several columns share."""
     if not rows:
         raise InputError("has no data rows", path, "export the recording again")
     counts = Counter(names)
@@ -441,7 +439,6 @@ def _number(cell: str, path: Path, line: int) -> float:
 
 
 def _why_uneven(cells: list[str], names: list[str]) -> str:
-    """Return a hint on the probable cause of a row that is longer or shorter than the header."""
     if len(cells) < len(names):
         return "add the missing cell or comma"
     # Decimal commas cut each number into two integers, so that rows are about twice as long.

@@ -178,7 +178,6 @@ def _read_poses(source: TibiaTable, recorded: Table) -> Array:
 def _fit_markers(
     source: TibiaTable, recorded: Table, stamps: Array, time: Array
 ) -> tuple[Array, Array, Array]:
-    """Return times, poses and residuals of the marker fit, around the frames."""
     check_roles(source.columns, ("time",), recorded.path, "tibia")
     points, reference = shank_points(source, recorded)
     names = [*source.markers_mm, *(joint.name for joint in source.joint_centre)]

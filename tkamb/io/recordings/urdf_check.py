@@ -102,7 +102,6 @@ _HEAVIEST = 1000.0
 
 
 def _check_attributes(element: ElementTree.Element, where: str) -> None:
-    """Raise an InputError if an attribute is unknown, not numbers or too large."""
     attributes = _ATTRIBUTES[element.tag]
     for key, text in element.attrib.items():
         if key not in attributes:
@@ -269,11 +268,6 @@ def _check_axes(
 
 
 def _check_limit(joint: ElementTree.Element, path: Path) -> None:
-    """Raise an InputError unless a joint states all limits, lower not above upper.
-
-    Equal limits are those of a joint that rests. tkamb does not use limits, but parsers of URDF
-    need them.
-    """
     limit, name = joint.find("limit"), joint.get("name")
     if limit is None or not {"lower", "upper", "effort", "velocity"} <= set(limit.keys()):
         hint = "give lower, upper, effort and velocity"

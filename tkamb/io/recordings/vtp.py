@@ -69,8 +69,6 @@ def _read(path: str | Path, select: "Callable[[_PolyData], Read]") -> Read:
 
 
 class _PolyData:
-    """A parsed PolyData file."""
-
     def __init__(self, content: bytes, path: str | Path) -> None:
         self._appended = b""
         self._raw = False
@@ -94,7 +92,6 @@ class _PolyData:
             self._appended = "".join((block.text or "").split()).removeprefix("_").encode()
 
     def triangles(self) -> tuple[Array, Indices]:
-        """Return points and triangles of all pieces."""
         points, faces, start = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
         for piece in self._root.iter("Piece"):
             if int(piece.get("NumberOfStrips", 0)):
@@ -113,7 +110,6 @@ class _PolyData:
         return np.concatenate(points), np.concatenate(faces)
 
     def values(self, name: str) -> Array:
-        """Return one array of point data, of all pieces."""
         result = []
         for piece in self._root.iter("Piece"):
             named = {array.get("Name"): array for array in piece.iterfind("PointData/DataArray")}
@@ -122,7 +118,6 @@ class _PolyData:
         return np.concatenate(result)
 
     def _polygons(self, piece: Element, points: Array) -> Indices:
-        """Return the polygons of a piece as triangles (k, 3)."""
         named = {array.get("Name"): array for array in piece.iterfind("Polys/DataArray")}
         count = int(piece.get("NumberOfPolys", 0))
         ends = self._array(named["offsets"], "offsets", count).astype(np.int64)
@@ -138,7 +133,6 @@ class _PolyData:
         return triangulated(points, index, ends)
 
     def _array(self, array: Element | None, name: str, most: int) -> NDArray:
-        """Return the values of an array; raise before more than `most` values are unpacked."""
         if array is None:
             raise KeyError(name)
         dtype = np.dtype(self._order + _TYPES[array.attrib["type"]])

@@ -363,7 +363,6 @@ def _wrap(table: MuscleWrapTable, bone: "Surface | None") -> "SagittalWrap":
 
 
 def _bone(table: BoneTable | None, chain: Chain, left: bool) -> "Surface | None":
-    """Return a bone's surface in the femur link's frame."""
     if table is None:
         return None
     from tkamb.io.recordings.meshes import BONE_SIZE, load_surface

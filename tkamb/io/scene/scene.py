@@ -277,7 +277,6 @@ def scene_files(path: Path) -> list[Path]:
 
 
 def _content(path: Path) -> dict[str, Any]:
-    """Return the keys of a scene file, merged with the keys of its base."""
     content = _parse(path)
     if "base" not in content:
         return content
@@ -291,7 +290,6 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def _merge(base: dict[str, Any], content: dict[str, Any]) -> dict[str, Any]:
-    """Return the keys of `base`, replaced by the keys of `content`. Tables are merged."""
     merged = base | content
     for key, value in content.items():
         if isinstance(value, dict) and isinstance(base.get(key), dict):

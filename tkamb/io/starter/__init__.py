@@ -49,7 +49,6 @@ def lay_out(directory: Path, person: "Person | None" = None) -> Path:
 
 
 def _reason_of_copy(error: OSError) -> str:
-    """Return the first reason of an error of `shutil.copytree`, which lists one per file."""
     causes = error.args[0] if error.args else ()
     texts = [str(cause[-1]) for cause in causes if isinstance(cause, tuple) and cause]
     return re.sub(r"^\[Errno \d+\] |: '.*$", "", texts[0]) if texts else str(error)
@@ -78,7 +77,6 @@ def _new(options: argparse.Namespace) -> int:
 
 
 def _person(options: argparse.Namespace) -> "Person | None":
-    """Return the patient that the options describe, or None for the default patient."""
     values = {
         "side": options.side,
         "mass": options.mass_kg,

@@ -204,7 +204,6 @@ def _numbers(values: Array) -> str:
 
 
 def _scale(path: Path, factors: dict[str, float]) -> None:
-    """Multiply columns of a table by factors. Other columns keep their text."""
     with path.open(newline="", encoding="utf-8") as file:
         header, *rows = csv.reader(file)
     factor_of: list[Callable[[str], str]] = [

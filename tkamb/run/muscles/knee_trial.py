@@ -278,12 +278,6 @@ def group_names(model: Path, side: Side) -> tuple[str, ...]:
 
 
 def _read_leg(path: Path, side: Side) -> Leg:
-    """Return a leg of a model.
-
-    Raises:
-        InputError: the model has no gravity, or a joint or constraint of the model, or a muscle of
-            the leg, cannot be read.
-    """
     leg = find_leg(read_osim(path, partial=True), side)
     leg.model.check_gravity()
     bodies = {body for group in leg_bones(leg).values() for body in group}

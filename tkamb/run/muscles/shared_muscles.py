@@ -273,11 +273,6 @@ def groups_of(case: Case) -> tuple[str, ...]:
 
 
 def _guided(case: Case, trial: KneeTrial) -> KneeTrial:
-    """Return the trial guided by the scene's EMG, or unchanged if EMG is only reported.
-
-    Raises:
-        InputError: the model lacks a muscle of the EMG, or a frame has no EMG.
-    """
     table, envelopes, time = case.scene.muscles, case.emg, case.motion.time
     assert table is not None and table.emg is not None and envelopes is not None
     for name in envelopes.channel_of:
@@ -303,7 +298,6 @@ def _guided(case: Case, trial: KneeTrial) -> KneeTrial:
 
 
 def _check_links(case: Case, insert_in_tibia: Array, hip: Array) -> None:
-    """Raise unless insert and hip have the same positions in model and URDF."""
     is_left, table = case.scene.patient.side == "left", case.scene.muscles
     assert table is not None
     insert = mirrored_pose(insert_in_tibia) if is_left else insert_in_tibia

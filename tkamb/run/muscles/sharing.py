@@ -443,7 +443,6 @@ class FrameProblems:
 
 
 def _weights(muscles: Sequence[OpenSimMuscle], sharing: Sharing) -> Array:
-    """Return the weights w (m,); their mean is 1."""
     if sharing.weights == "equal":
         return np.ones(len(muscles))
     volume = np.array([m.optimal_fibre_length_m * m.max_isometric_force_N for m in muscles])

@@ -290,14 +290,6 @@ def trial_problems(
 def _bones(
     groups: Mapping[str, Sequence[str]], bones: Motion, needed: Array, pulls: Pulls
 ) -> Bones:
-    """Return the bones with their loads.
-
-    Args:
-        groups: bone -> names of its bodies.
-        bones: poses of the model's bodies.
-        needed: wrench that the motion of each body requires, (f, bodies, 6).
-        pulls: wrenches of the muscles on the bones.
-    """
     places = [[bones.bodies[name] for name in bodies] for bodies in groups.values()]
     demand = np.stack([needed[:, place].sum(axis=1) for place in places], axis=1)
     poses = bones.poses[:, [place[0] for place in places]]
@@ -331,7 +323,6 @@ def _check(
     coordinates: Sequence[str],
     sharing: Sharing,
 ) -> None:
-    """Raise an InputError for an unknown name, wrong shape or value out of range."""
     where, model = kinematics.model.name, kinematics.model
     for what, names, available in (
         ("body", loads, model.bodies),

@@ -194,7 +194,6 @@ def sample_questions(case: Case) -> Iterator[Question]:
 def _odd_text(
     samples: Sequence[OddSample], worst: OddSample, ground: GroundReactionTable | None
 ) -> str:
-    """Return the question about the outliers of a file."""
     more = f" and {len(samples) - 1} more" if len(samples) > 1 else ""
     of_plates = (
         ground is not None
@@ -291,12 +290,10 @@ def _gaps(clearance: "FirstTouch", coordinates: Array) -> Array:
 
 
 def _turned_gaps(clearance: "FirstTouch", coordinates: Array, name: str) -> Array:
-    """Return the gaps with the inverted sign of one coordinate."""
     flipped = coordinates.copy()
     flipped[:, KNEE_COORDINATES.index(name)] *= -1.0
     return _gaps(clearance, flipped)
 
 
 def _difference(gaps: Array) -> float:
-    """Return the standard deviation of the difference between the condyles' gaps, m."""
     return float(np.std(gaps[:, 0] - gaps[:, 1]))

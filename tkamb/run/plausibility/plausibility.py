@@ -100,11 +100,6 @@ class Plausibility:
 def _answered(
     questions: Sequence[Question], answers: Mapping[str, str]
 ) -> tuple[tuple[Question, ...], tuple[str, ...]]:
-    """Return the questions without an answer, and a sentence for each answered question.
-
-    Args:
-        answers: some words of a question -> its answer.
-    """
     unanswered, text = list(questions), []
     for words, answer in answers.items():
         matching = [

@@ -77,7 +77,6 @@ def _on_scale(values: ArrayLike, limit: float, scale: Colours, none: str = SLACK
 
 @lru_cache(maxsize=1)
 def _scales() -> dict[str, Colours]:
-    """Return the scales (256, 3) by name."""
     stored = json.loads(asset("tkamb.show.view", "scales.json"))
     return {
         name: np.frombuffer(bytes.fromhex(text), np.uint8).reshape(256, 3)

@@ -322,7 +322,6 @@ class LiveKnee:
         return recording
 
     def _forget(self) -> None:
-        """Delete the least recently used models, and the inserts that only these models need."""
         for old in [*self._recordings][: -BENCH_LIMIT.kept_models]:
             del self._recordings[old]
             self._before.pop(old, None)
@@ -432,7 +431,6 @@ def _numbers(frame: Frame, recording: Recording, lengths: dict[str, float]) -> d
 
 
 def _without_muscles(case: Case) -> Case:
-    """Return the case without muscles and patella: bones, ligaments and contact remain."""
     chain = Chain(load_urdf(case.scene.patient, False), False)
     update: dict[str, Any] = {"patella": None, "muscles": None, "quadriceps": None, "muscle": ()}
     if case.scene.contact is not None:

@@ -341,15 +341,12 @@ def _node(path: str) -> NodePath:
 
 
 class _Mesh(TriangularMeshGeometry):
-    """meshcat's mesh with the given normals and optional colours per vertex."""
-
     def __init__(self, shape: Shaded, colours: Colours | None) -> None:
         share = None if colours is None else colours / np.float32(255.0)
         super().__init__(shape.vertices, shape.faces, share)
         self._normals = shape.normals
 
     def lower(self, object_data: Any) -> Any:
-        """Return the JSON object of the mesh for three.js."""
         lowered = super().lower(object_data)
         lowered["data"]["attributes"]["normal"] = pack_numpy_array(self._normals.T)
         return lowered

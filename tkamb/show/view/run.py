@@ -59,12 +59,6 @@ class CaseResults:
         return result
 
     def _geometry(self, k: int, row: int | None) -> KneeGeometry:
-        """Return the geometry of the knee's equations for a frame.
-
-        Args:
-            k: frame of the motion.
-            row: row of the frame's pressure map; None: the frame has no map.
-        """
         maps, recording = self.results.maps, self.recording
         if maps is None or row is None or recording.muscles is not None:
             return recording.loads(k).geometry

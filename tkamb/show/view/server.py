@@ -211,7 +211,6 @@ class ViewServer:
         return f"http://{HOST}:{self._server.server_address[1]}/{self._token}/"
 
     def _repr_html_(self) -> str:
-        """Return a link for notebooks."""
         return f'<a href="{self.url}" target="_blank" rel="noopener">{self.url}</a>'
 
     def serve(self) -> None:

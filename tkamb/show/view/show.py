@@ -90,7 +90,6 @@ class Show:
             temporary.write_bytes(picture)
 
     def _repr_html_(self) -> str:
-        """Return the page in a frame, for notebooks."""
         return (
             f'<iframe srcdoc="{escape(self.html())}" style="width:100%;height:640px;border:0">'
             "</iframe>"

@@ -232,7 +232,6 @@ def _floor_pose(geometry: KneeGeometry, tibia_in_laboratory: Array, floor: float
 
 
 def _foot_surface(height: float) -> Surface:
-    """Return a foot whose ankle is `height` (m) above the sole."""
     ankle = (0.0, height / MILLIMETRE, 0.0, ANKLE_RADIUS_MM)
     sole, leg = _hull((*SOLE, INSTEP)), _hull((INSTEP, ankle))
     faces = np.concatenate([sole.faces, leg.faces + len(sole.vertices)])
@@ -240,7 +239,6 @@ def _foot_surface(height: float) -> Surface:
 
 
 def _hull(balls: Sequence[tuple[float, ...]]) -> Surface:
-    """Return the convex hull of balls, given by centre and radius in mm."""
     points = [sphere_points() * radius + centre for *centre, radius in balls]
     return hull(np.concatenate(points) * MILLIMETRE, "balls")
 

@@ -323,7 +323,6 @@ def _slice(text: str, path: Path) -> slice:
 
 
 def _complaint(error: ValidationError, path: Path) -> InputError:
-    """Return the first error in one line. Unknown keys come first, missing keys last."""
     rank = {"extra_forbidden": 0, "missing": 2}
     first = min(error.errors(), key=lambda detail: rank.get(detail["type"], 1))
     key = ".".join(str(part) for part in first["loc"])

@@ -274,7 +274,6 @@ def _identity(cohort: Cohort) -> dict[str, Any]:
 
 @contextmanager
 def _parts(directory: Path, part: Part | None, resume: bool) -> Iterator[list[Path]]:
-    """Lock and yield the folders of all parts. Yield none for a part, or without `resume`."""
     with ExitStack() as stack:
         folders = []
         if part is None and resume:

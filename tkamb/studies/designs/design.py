@@ -187,7 +187,6 @@ UNITS = ("_deg_mm", "_deg", "_mm")
 
 
 def _part(kind: type[_Part], table: Mapping[str, Any], file: Path) -> _Part:
-    """Return a part from its table. The name of a field is the key without its unit."""
     names = {field.name for field in fields(kind)}
     values = {}
     for key, value in table.items():

@@ -243,7 +243,6 @@ def estimate_uncertainty(
 
 
 def _check_correlation(case: Case, inputs: Sequence[VariedInput], indices: bool) -> None:
-    """Raise if the correlations are impossible, or combined with Sobol' indices."""
     tables = uncertainty_of(case).correlation
     correlation_root(tables, [one.name for one in inputs])
     if tables and indices:

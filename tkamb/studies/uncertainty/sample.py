@@ -161,7 +161,6 @@ def _ligament(case: Case, bundle: Ligament, draw: Draw) -> Ligament:
 
 
 def _strand(bundle: Ligament, case: Case, draw: Draw) -> Ligament:
-    """Return a ligament of the patella whose tibial end has the error of the tuberosity."""
     ends: dict[str, Any] = {end: getattr(bundle, end) for end in (PROXIMAL, DISTAL)}
     for name, point in ends.items():
         if case.chain.carrier(point.link) == "tibia":
@@ -170,7 +169,6 @@ def _strand(bundle: Ligament, case: Case, draw: Draw) -> Ligament:
 
 
 def _head(case: Case, head: "HeadShare", draw: Draw) -> "HeadShare":
-    """Return a head whose ends have the errors of the quadriceps' line."""
     (line,) = case.muscles
     shifts = [draw.place(f"muscle_attachment.{line.name}.{end}") for end in LINE_ENDS]
     origin, insertion = _on_femur(case, head.origin, draw), head.insertion

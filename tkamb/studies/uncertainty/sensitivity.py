@@ -202,7 +202,6 @@ def screen(
 def _of_result(
     result: str, values: Array, flexion: float, inputs: Sequence[VariedInput]
 ) -> list[Screened]:
-    """Return the effect of each input from `values` (1 + 2 d,), with the largest change first."""
     changes = values[1:] - values[0]
     rows = [
         Screened(result, float(values[0]), float(flexion), varied, float(minus), float(plus))
@@ -257,7 +256,6 @@ def _change(value: float) -> str:
 
 
 def _bar(row: Screened, largest: float, width: int) -> str:
-    """Return the bar of an input, with decreases to the left and increases to the right."""
     changes = [change for change in (row.minus, row.plus) if np.isfinite(change)]
     scale = width / largest if largest > 0 else 0.0
     below, above = (round(scale * max([0.0, *(sign * c for c in changes)])) for sign in (-1, 1))

@@ -227,7 +227,6 @@ class WearReport:
         return questions
 
     def _own_factor(self, laws: list[dict[str, Any]]) -> list[str]:
-        """Return a line if the simulated law has another wear factor than the material's laws."""
         own = _single_factor(self.case.law)
         others = {law["law"]: law["wear_factor_mm3_per_Nm"] for law in laws}
         name = self.case.law.name
@@ -275,7 +274,6 @@ class WearReport:
         ]
 
     def _control_lines(self) -> list[str]:
-        """Return the ranges of the coordinates in equilibrium in the last cycle; empty: none."""
         drive = self.case.motion.drive
         if drive is None:
             return []

@@ -232,7 +232,6 @@ def simulate_wear(
 
 
 def _cycle(case: WearCase, state: WearState) -> CycleWear | str:
-    """Return the wear of a cycle on the current insert, or the reason why there is no contact."""
     insert = case.articular.lowered(state.fall)
     maps = case.engine.maps(insert, case.motion)
     rows = _rows(maps, case.motion)
