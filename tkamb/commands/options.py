@@ -98,7 +98,6 @@ class Rule:
     """The condition under which an option has an effect.
 
     Args:
-        option: name of the option on the command line.
         needs: options; at least one of them must be given. Empty: none is needed.
         excludes: options with which `option` has no effect.
         because: reason, printed after "does not go with --x" or "needs --x".
@@ -216,11 +215,6 @@ def check_options(
     parser: argparse.ArgumentParser, arguments: Sequence[str], options: argparse.Namespace
 ) -> None:
     """Raise if an option has no effect because of the other options.
-
-    Args:
-        parser: parser of the whole command line.
-        arguments: arguments that the parser has accepted.
-        options: parsed options.
 
     Raises:
         InputError: an option has no effect; the message names what it needs or excludes.

@@ -25,11 +25,9 @@ class Setting:
 
     Args:
         name: dotted name, such as "lattice_solver.force_tolerance".
-        value: current value.
         default: default value.
         meaning: unit, meaning and origin.
         algorithm: first line of the docstring of the settings class.
-        module: module of the settings object.
     """
 
     name: str

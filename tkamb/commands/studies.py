@@ -240,7 +240,6 @@ def gather(row_source: Iterable[T], costs: Sequence[float]) -> tuple[list[T], bo
     """Collect rows under a progress bar that shows the remaining time.
 
     Args:
-        row_source: iterator that computes the rows.
         costs: expected time of each row, in any unit.
 
     Returns:

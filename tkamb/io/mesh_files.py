@@ -65,7 +65,6 @@ def lattice_of_file(
     """Build the lattice of an insert's mesh, and write it to `out` unless that is None.
 
     Args:
-        insert: STL, OBJ or PLY file with a closed surface.
         resolution_mm: edge length of a cell, mm.
         units: unit of the mesh: "m", "cm", "mm" or "inch".
         axes: axes of the mesh that point anterior, superior and right.
@@ -100,9 +99,7 @@ def write_body(path: str | Path, number: int, out: str | Path) -> str:
     The mesh is repaired first, as in a run.
 
     Args:
-        path: the mesh.
         number: number of the body in `tkamb mesh check`; body 1 has the largest surface.
-        out: path of a new .stl, .ply or .obj file.
 
     Returns:
         One line on the written body.

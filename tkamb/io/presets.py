@@ -26,7 +26,6 @@ class Change:
     """A key of the scene whose value a preset has changed.
 
     Args:
-        key: dotted key, as for `--set`.
         before: value in the scene; None: the key is absent, so that the default applies.
         after: value of the preset; None: the table is left out.
     """
@@ -42,7 +41,6 @@ class AppliedPreset:
 
     Args:
         name: name of the preset, as in `--as`.
-        source: reference of the study.
         changes: keys that had another value in the scene.
         overridden: keys of the preset that `--set` or another option overrides.
         departures: remaining differences between the scene and the study, in words.
@@ -93,7 +91,6 @@ class Preset:
 
     Attributes:
         name: name of the preset, as in `--as`.
-        source: reference of the study.
         settings: dotted key of the scene -> value; None: the table is left out.
         needs: dotted key of a required table -> reason for which the study needs it.
     """

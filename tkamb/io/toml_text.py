@@ -49,9 +49,6 @@ _DIGITS = re.compile(rf"[0-9_]{{{LIMITS.digits + 1},}}|0[xob][0-9a-fA-F_]{{{LIMI
 def read_toml(path: str | Path, *, what: str) -> dict[str, Any]:
     """Return the content of a TOML file.
 
-    Args:
-        what: name of the kind of file in messages.
-
     Raises:
         InputError: the file cannot be read, is not TOML, or exceeds `TomlLimits`.
     """
@@ -60,9 +57,6 @@ def read_toml(path: str | Path, *, what: str) -> dict[str, Any]:
 
 def parse_toml(text: str, where: object) -> dict[str, Any]:
     """Return the content of TOML text.
-
-    Args:
-        text: the TOML text.
 
     Raises:
         InputError: the text is not TOML, or exceeds `TomlLimits`.

@@ -70,9 +70,6 @@ def split_of(columns: Mapping[str, Any]) -> Split:
 
     The split is by deformation if the pose determines it in all frames, else by equilibrium. The
     estimates differ if their medial shares are more than `AGREEMENT.share_difference` apart.
-
-    Args:
-        columns: columns of results.csv.
     """
     frames = len(columns["status"])
     shares = {name: _share(columns, name) for name in ESTIMATES}
@@ -104,7 +101,6 @@ def peaks(
     """Return force -> its largest value with its bands at that frame, BW.
 
     Args:
-        columns: columns of results.csv.
         bands: columns of bands.csv; empty: no input was varied.
         body_weight: body weight, N.
 

@@ -19,7 +19,6 @@ class Column:
         name: name of the column in the file, ends with the unit.
         meaning: one line. Vectors are in the insert frame unless the line names another.
         needs: scene tables without which the column is empty.
-        kind: type of the cells.
         optional: True if a scene without `needs` has no such column; False if the column is empty.
     """
 

@@ -59,7 +59,6 @@ class Deck:
         load: load along -y, N.
         element: "C3D8" (full integration, locks as nu approaches 0.5) or "C3D8I" (incompatible
             modes).
-        comments: lines at the top of the deck.
     """
 
     lattice: Lattice
@@ -167,7 +166,6 @@ def febio_text(problem: "PressProblem", approach: float, comments: Iterable[str]
 
     Args:
         approach: displacement of the femoral component along -y from first touch, m.
-        comments: lines at the top of the file.
 
     Raises:
         InputError: a bearing that is not fixed, or a material that is not linear.

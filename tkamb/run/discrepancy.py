@@ -114,11 +114,6 @@ class TrialError:
 
     Args:
         activity: name of the activity, as in [output] activity.
-        force: total, medial or lateral.
-        frames: number of compared frames.
-        bias: mean of the error over the frames.
-        scatter: standard deviation of the error over the frames.
-        independent_frames: effective sample size of the variance of the scatter.
         inputs: root mean square over the frames of the standard deviation due to the inputs, as a
             share of G.
         correlation_s: time in which the autocorrelation of the error falls to 1/e, s.
@@ -141,11 +136,9 @@ class Discrepancy:
     """Distribution of the discrepancy of one force.
 
     Args:
-        mean: mean, as a share of the load G.
         deviation: scale of Student's t, as a share of G; the variance due to the inputs is
             subtracted.
         freedom: degrees of freedom of Student's t, in general not an integer.
-        own_trials: number of trials of the activity.
         trials: number of trials of all activities.
     """
 
@@ -180,7 +173,6 @@ def trial_error(
     """Return the error of a predicted force in a trial; None: too few frames.
 
     Args:
-        names: trial, subject, activity, force.
         time: times, s, (f,).
         samples: force of each sample with varied inputs, N, (n, f); NaN in failed frames.
         measured: measured force, N, (f,); NaN in frames without a measurement.
@@ -217,7 +209,6 @@ def fitted(errors: Sequence[TrialError], force: str, activity: str | None) -> Di
 
     Args:
         errors: errors of all compared trials.
-        force: total, medial or lateral.
         activity: activity of the scene. Without trials of it (or None) the mean is 0.
     """
     chosen = [one for one in errors if one.force == force]
@@ -259,9 +250,7 @@ def band_with_discrepancy(
 
     Args:
         samples: force of each sample, (n, f); NaN in failed frames.
-        discrepancy: discrepancy from `fitted`.
         load: load G from `load_of` in the samples' unit, (f,).
-        percents: percentiles at the ends of the band.
     """
     added = stdtrit(discrepancy.freedom, _middles(DISCREPANCY.quantiles))
     added = discrepancy.mean + discrepancy.deviation * added

@@ -47,7 +47,6 @@ class PressProblem:
         lattice: grid of the insert with contact nodes on the smooth surface.
         nodes: contact nodes, (c,).
         map: contact surface of the insert.
-        floor: femoral surface seen from below.
         pose: pose_femoral_in_insert at the guessed depth, (4, 4).
         depth: guessed approach, m.
         touchable: mask of the contact nodes that can touch, (c,).
@@ -122,7 +121,6 @@ class FramePress:
         peak_pressure: largest pressure of the map, Pa.
         origin: text with frame number, folder of the run and contact model.
         lateral: direction of insert z, "lateral" or "medial".
-        notes: differences between run and deck that affect a comparison.
     """
 
     problem: PressProblem
@@ -176,7 +174,6 @@ def frame_press(folder: Path, frame: int, resolution_mm: float | None = None) ->
     """Return the contact of one frame of a folder of results.
 
     Args:
-        folder: results folder of `tkamb run`.
         frame: row of results.csv; negative numbers count from the end.
         resolution_mm: edge of the hexahedra, mm; None: the spacing of the run.
 

@@ -49,7 +49,6 @@ def guarded(command: Callable[[], int], options: argparse.Namespace) -> int:
 
     Args:
         command: function that returns an exit status.
-        options: parsed options of the command line.
     """
     open_streams()
     try:
@@ -86,7 +85,6 @@ def in_options(message: str, where: object = None) -> str:
     """Return a message with options of commands in place of arguments of Python functions.
 
     Args:
-        message: text of an error.
         where: place of the error; its first word may be the name of an argument.
     """
     name = where.partition(" ")[0] if isinstance(where, str) else ""

@@ -49,17 +49,14 @@ class KnownError:
     """Largest relative errors of one setting.
 
     Args:
-        approach: error of the approach.
         force: error of a condyle's force, relative to the load; None: no case has two condyles.
         mean_pressure: error of a condyle's mean pressure.
         peak_pressure: error of a condyle's peak pressure.
         area: error of a condyle's contact area.
-        cases: number of measured cases.
         situations: place of the contact ("interior", "flank", "edge") -> quantity -> largest error
             at that place. Contacts with a flag that is not about the edge are excluded.
         covered: share of the errors on held-out pairs below the stored errors; None: no pair was
             held out.
-        pairs: number of pairs of bodies.
         range: quantity -> smallest and largest value on these pairs: "thickness_over_radius",
             thickness of the insert over the radius of the circle with the contact's area, and
             "poisson_ratio". All inserts stand on the whole of their bottoms; the foundations and
@@ -83,7 +80,6 @@ class ContactSituation:
     """What decides whether an error measured on other pairs applies to a contact.
 
     Args:
-        flags: flags of the contact, or its status.
         thickness_over_radius: of each loaded condyle, thickness of the insert over the radius of
             the circle with the contact's area.
         poisson_ratio: of the insert.
@@ -124,7 +120,6 @@ class ContactSituation:
         """Return the situation of the run's frame of largest peak pressure.
 
         Args:
-            columns: columns of results.csv.
             status: status of each frame.
             poisson_ratio: of the insert.
             facet_sag: m, sag of the facets of both meshes.
@@ -178,7 +173,6 @@ def stated_error(
     Args:
         resolution_mm: spacing of the map points, mm.
         material: name of the insert's material.
-        contact: the contact that the error is stated for.
     """
     error = known_error(model, resolution_mm, material, options)
     if error is None:
@@ -257,12 +251,7 @@ def as_json(error: KnownError | str | None) -> dict[str, Any] | str:
 
 
 def known_error_words(error: Mapping[str, Any] | str, names: Iterable[str]) -> str:
-    """Return full sentences on the known errors of some quantities.
-
-    Args:
-        error: value of the key `known_error` in summary.json.
-        names: quantities, fields of `KnownError`.
-    """
+    """Return full sentences on the known errors of some quantities."""
     if isinstance(error, str):
         return f"The error of this setting of the contact model is {error}."
     names = list(names)
@@ -282,12 +271,7 @@ def known_error_words(error: Mapping[str, Any] | str, names: Iterable[str]) -> s
 
 
 def short_error_words(error: Mapping[str, Any] | str, names: Iterable[str]) -> str:
-    """Return one sentence on the known errors that refers to the report's conclusions.
-
-    Args:
-        error: value of the key `known_error` in summary.json.
-        names: quantities, fields of `KnownError`.
-    """
+    """Return one sentence on the known errors that refers to the report's conclusions."""
     if isinstance(error, str):
         return known_error_words(error, names)
     return (

@@ -343,7 +343,6 @@ class ContactMaps:
 
         Args:
             name: name of the array, such as "pressure_Pa".
-            frames: numbers of the frames, or a slice of them.
         """
         if not isinstance(self.source, Path):
             return np.asarray(self.source[name], float)[frames]

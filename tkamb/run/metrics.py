@@ -176,7 +176,6 @@ def map_rows(results: "Results", maps: "ContactMaps | None" = None) -> dict[int,
     """Return frame -> index of its map, for every frame with a map.
 
     Args:
-        results: results of a run.
         maps: maps of the run; None: those of the insert.
     """
     maps = results.maps if maps is None else maps

@@ -97,7 +97,6 @@ def recording_of(
         shared: state of the nominal case, for a sample; None: the case is no sample.
         near: whether to skip the check that the condyles are near the insert.
         contact: prepared contact model; None: the contact model of the scene.
-        split_sensitivity: see `FrameMethod`.
         cam: prepared cam and post with the same contact model; None: there are none yet.
 
     Raises:

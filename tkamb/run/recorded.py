@@ -76,8 +76,6 @@ def compare_measured(
     without prediction (not failed, but NaN).
 
     Args:
-        columns: columns of results.csv, with `measured_<name>_N`.
-        names: names of the measured forces: total, medial, lateral.
         body_weight: body weight, N.
     """
     failed = np.array([status.startswith(FAILED) for status in columns["status"]], bool)
@@ -137,10 +135,6 @@ def compare_emg(envelopes: "Envelopes", columns: Mapping[str, Any]) -> dict[str,
     The agreement is Pearson's r and RMSE of a(t) and e(t), and the lag L with the largest r of a(t)
     and e(t - L). The lag is positive if the activation is later than the envelope. It uses frames
     with an envelope for all `LAGS`, and is NaN if r is largest at the first or last lag.
-
-    Args:
-        envelopes: EMG envelopes of the muscles.
-        columns: columns of results.csv.
     """
     time = np.asarray(columns["time_s"])
     result = {}
@@ -171,7 +165,6 @@ def fitted_normalisation(
     Σ (a - s e)² over frames and muscles of the channel. None: s is not positive.
 
     Args:
-        envelopes: EMG envelopes e of the muscles.
         columns: columns of results.csv of a run without guidance by EMG.
     """
     time, result = np.asarray(columns["time_s"]), {}

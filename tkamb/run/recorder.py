@@ -87,7 +87,6 @@ class Shards:
     """The files of the finished frames.
 
     Args:
-        directory: output folder of the run.
         identity: identity of the run, name -> text or numbers.
         resume: whether to continue an earlier run with the same identity. Otherwise its frames are
             removed when the first frame is written.
@@ -189,7 +188,6 @@ def check_same_run(
 
     Args:
         earlier: identity of the run in the folder; None: no run.
-        identity: identity of the run to resume.
     """
     if earlier is None:
         return
@@ -219,11 +217,7 @@ LARGEST_TIME_SHARE = 0.02
 
 
 class Recorder:
-    """Stores the finished frames of a run in memory.
-
-    Attributes:
-        rows: rows of results.csv of the finished frames.
-    """
+    """Stores the finished frames of a run in memory."""
 
     def __init__(self) -> None:
         self.rows = RowTable()
@@ -236,7 +230,6 @@ class Recorder:
         """Prepare to record pressure maps. A run without contact does not call it.
 
         Args:
-            name: file of the maps, a key of `MAPS`.
             points: map points, m, (n, 3).
             triangles: indices of neighbouring map points, (k, 3).
             labels: attributes of contact.h5.

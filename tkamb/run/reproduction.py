@@ -58,9 +58,7 @@ class Verdict:
     """The verification of a results folder.
 
     Args:
-        differs: messages on changed files.
         notes: messages on other facts, such as another version of the code.
-        inputs: number of checked input files.
     """
 
     differs: tuple[str, ...]
@@ -156,7 +154,6 @@ def inputs_folder(
     """Return the folder of the scene of a run, or of its copy.
 
     Args:
-        summary: content of its summary.json.
         given: folder in which to look for a copy of the scene.
 
     Raises:
@@ -183,7 +180,6 @@ class Rerun:
 
     Args:
         columns: column -> largest difference, as a share of its largest value or of one unit.
-        statuses: number of frames with another status.
     """
 
     columns: Mapping[str, float]
@@ -264,9 +260,6 @@ def pack(directory: str | Path, archive: str | Path) -> int:
 
     The archive holds the files of the results folder and, in `inputs`, all files that the run read.
     Their places relative to each other stay, so that the scene finds them.
-
-    Args:
-        archive: path of the archive, *.zip.
 
     Returns:
         Number of input files.

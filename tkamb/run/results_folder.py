@@ -50,7 +50,6 @@ def read_results(directory: str | Path, *, check: bool = True) -> Results:
     """Read results from a folder. The numbers are exactly the written ones.
 
     Args:
-        directory: results folder. Nothing is written into it.
         check: whether to compare the files with the SHA-256 in summary.json.
 
     Raises:
@@ -257,10 +256,6 @@ def table_metadata(columns: Mapping[str, Any], summary: Mapping[str, Any]) -> st
 
     It is a file of its own, because a comment above the header would stop readers of CSV. Source:
     W3C, Metadata Vocabulary for Tabular Data (2015), section 5.
-
-    Args:
-        columns: columns of results.csv.
-        summary: content of summary.json.
     """
     meanings = {one.name: one.meaning for one in COLUMNS}
     rows = []

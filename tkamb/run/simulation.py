@@ -131,10 +131,7 @@ def finished_in_order(
     """Yield frames from worker processes in their order.
 
     Args:
-        team: pool of workers with the task `ChunkSolver`.
-        slips: slips of the recorded motion, see `FrameSolver`.
         indices: all frames of the run. They determine the chunks.
-        remaining: frames to compute.
 
     Raises:
         ComputationError: a worker was killed.

@@ -67,7 +67,6 @@ def summary_of(
     """Return the content of summary.json (docs/results.md).
 
     Args:
-        columns: columns of results.csv.
         seconds: part of the computation -> computing time, s.
         path: path of the scene file; None: the scene is not from a file.
         strains: ligament bundle -> strains at `STRAIN_FLEXIONS`.
@@ -313,11 +312,7 @@ def _marker_facts(case: Case) -> dict[str, Any]:
 
 
 def reserves(columns: Mapping[str, Any]) -> dict[str, dict[str, float]]:
-    """Return coordinate -> largest reserve, and number of frames with a large reserve.
-
-    Args:
-        columns: columns of results.csv.
-    """
+    """Return coordinate -> largest reserve, and number of frames with a large reserve."""
     result = {}
     for column in columns:
         if not belongs(column, RESERVE):

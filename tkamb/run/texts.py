@@ -40,9 +40,7 @@ def lines(package: str, name: str, *, strict: bool = True, **facts: Any) -> list
 
     Args:
         package: package of the template, for example "tkamb.run".
-        name: file name in the folder `assets` of the package.
         strict: whether a missing value raises an error. Otherwise it is empty and false.
-        facts: values of the names in the template.
     """
     return nonempty(environment(package, False, strict).get_template(name).render(facts))
 

@@ -20,7 +20,6 @@ class Stages:
     """Prints the stages of a run with their times. A stage ends when the next one begins.
 
     Args:
-        count: number of stages.
         stream: output stream; None: standard error. Stages are printed on a terminal only.
     """
 
@@ -83,11 +82,7 @@ CLOCKS = {
 
 @dataclass(eq=False)
 class Profile:
-    """Profile of a run. It records imported modules and opened files from its creation.
-
-    Attributes:
-        opened: files that were opened for reading, in order.
-    """
+    """Profile of a run. It records imported modules and opened files from its creation."""
 
     opened: list[Path] = field(default_factory=list)
 

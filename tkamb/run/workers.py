@@ -107,12 +107,7 @@ thread-safe."""
 
 
 def answer(packed: bytes, number: int, job: Any) -> Any:
-    """Return the answer to a job on a worker of the cluster.
-
-    Args:
-        packed: pickled `make` and `arguments` of a `Task`.
-        number: number of the job.
-    """
+    """Return the answer to a job on a worker of the cluster."""
     with _one_at_a_time:
         return _unpacked(packed)(number, job)
 
@@ -140,7 +135,6 @@ class Task:
     Args:
         make: importable class or function that prepares a worker. It returns the function of the
             jobs, which takes number and content of a job.
-        arguments: arguments of `make`.
     """
 
     make: Callable[..., Callable[[int, Any], Any]]
@@ -185,10 +179,6 @@ class PoolOptions:
     def answers(self, task: Task, tasks: Sequence[Numbered]) -> Iterator[Numbered]:
         """Yield the numbers and answers of jobs in the order in which they finish.
 
-        Args:
-            task: task of the workers.
-            tasks: numbers and contents of the jobs.
-
         Raises:
             ComputationError: a worker was killed, or the scheduler has ended.
         """
@@ -197,11 +187,7 @@ class PoolOptions:
 
     @contextmanager
     def team(self, task: Task, count: int) -> Iterator["WorkerPool"]:
-        """Provide a pool of workers, which begin to prepare at once in the background.
-
-        Args:
-            task: task of the workers.
-        """
+        """Provide a pool of workers, which begin to prepare at once in the background."""
         processes = self.dask is None and self.workers > 1 and count > 1
         team = WorkerPool(self, task, min(self.workers, count) if processes else 0)
         try:
@@ -214,13 +200,8 @@ class WorkerPool:
     """Worker processes that compute the jobs of one task.
 
     Args:
-        options: options of the pool.
-        task: task of the workers.
         count: number of worker processes; 0: the jobs are computed on the cluster of `options`, or
             in this process.
-
-    Attributes:
-        processes: the worker processes.
     """
 
     def __init__(self, options: PoolOptions, task: Task, count: int) -> None:
@@ -255,9 +236,6 @@ class WorkerPool:
 
     def answers(self, tasks: Sequence[Numbered]) -> Iterator[Numbered]:
         """Yield the numbers and answers of jobs in the order in which they finish.
-
-        Args:
-            tasks: numbers and contents of the jobs.
 
         Raises:
             InputError: the preparation of a worker fails.

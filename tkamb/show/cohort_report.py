@@ -256,7 +256,6 @@ def draw_groups(groups: Mapping[str, Group], name: str, highest: float) -> Figur
 
     Args:
         groups: name in the legend -> group.
-        name: name of the column.
         highest: largest value of all plots of the column, which share one vertical scale.
     """
     with settings():

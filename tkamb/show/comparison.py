@@ -120,8 +120,6 @@ class Run:
     """One folder of results.
 
     Args:
-        label: short name, unique among the runs.
-        axis: horizontal axis of its curves.
         pairing: pairing with the frames of the first run; None: frames cannot be paired.
     """
 
@@ -137,16 +135,13 @@ class Difference:
     """Difference of one column: a run minus the first run.
 
     Args:
-        run: label of the run.
         column: name of the column, with its unit.
         max_abs: largest absolute difference.
         percent: largest difference, % of the largest absolute value of the first run; NaN if that
             value is zero.
         at_frame: frame of the first run with the largest difference.
         at: position of this frame on the axis, deg, % or s.
-        rms: root mean square of the differences.
         mean: mean of the signed differences.
-        frames: number of compared frames.
     """
 
     run: str
@@ -207,7 +202,6 @@ def compare_folders(folders: Sequence[str | Path], axis: str | None = None) -> C
     """Read folders of results and compare each with the first.
 
     Args:
-        folders: two to eight folders that `tkamb run` wrote.
         axis: "flexion", "cycle" or "time"; default: the axis of all the runs.
 
     Raises:

@@ -42,7 +42,6 @@ class Quantity:
     """Quantity of one picture.
 
     Args:
-        title: name of the quantity.
         unit: unit of the values.
         values: function of the results of a run that returns (f,) values.
     """
@@ -153,7 +152,6 @@ def draw_maps(comparison: Comparison, frame: int) -> Figure | None:
     """Return the runs' pressure maps on one colour scale; None without any map.
 
     Args:
-        comparison: compared runs.
         frame: frame of the first run. Each other run shows its nearest frame on the axis.
     """
     frames = [

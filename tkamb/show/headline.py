@@ -54,7 +54,6 @@ class Card:
     Args:
         value: the number with its unit.
         sentence: one sentence: place in the motion, or meaning of the number.
-        more: further sentences, which the report unfolds.
         warning: whether the card is highlighted as a warning.
     """
 
@@ -134,11 +133,7 @@ def _where(results: "Results", axis: HorizontalAxis, frame: int) -> str:
 
 
 def peak_words(peak: Mapping[str, Any]) -> str:
-    """Return a peak force with its bands in words, body weights.
-
-    Args:
-        peak: entry of `claims.peaks`.
-    """
+    """Return a peak force with its bands in words, body weights."""
     if peak.get("p05") is None:
         return f"{peak['nominal']:.2f}"
     words = f"{peak['median']:.2f} ({peak['p05']:.2f}–{peak['p95']:.2f}"

@@ -59,7 +59,6 @@ class LegFrame:
         frame: frame of the motion.
         joints: centres of hip, knee and ankle, shape (3, 3). The knee is the origin of the insert
             frame.
-        bodies: surfaces of the implant with their colours.
         lines: ligaments and tendons, each with points (n, 3), its colour and its name.
         force: force on the foot, N, shape (3,); None without a plate.
         point: point of application of the force, shape (3,).
@@ -150,7 +149,6 @@ class View:
             which is computed as a right one.
         towards: horizontal direction (3,) towards the reader.
         left: anatomical direction to the left of the page, for example "anterior".
-        right: anatomical direction to the right of the page.
     """
 
     across: Array

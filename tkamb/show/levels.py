@@ -151,7 +151,6 @@ def _covered(
 
     Args:
         corners: corners (k, 3, 2) of the triangles, row and column, in steps of the grid.
-        shape: number of rows and of columns of the grid.
     """
     first = np.maximum(np.ceil(corners.min(axis=1) - EDGE_TOLERANCE), 0.0).astype(np.int64)
     last = np.minimum(np.floor(corners.max(axis=1) + EDGE_TOLERANCE), np.array(shape) - 1)

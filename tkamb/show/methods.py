@@ -107,9 +107,6 @@ class Methods:
 def methods(summary: Mapping[str, Any]) -> Methods:
     """Return the Methods paragraph of a run.
 
-    Args:
-        summary: `results.summary`, or the content of summary.json.
-
     Raises:
         InputError: the summary has no `scene_tables`. A version before 0.2.0 wrote it.
     """

@@ -73,7 +73,6 @@ class Cell:
 
     Args:
         title: name of the muscle, or of the EMG channel with its number of muscles.
-        muscles: names of the muscles in the plot.
         envelope: name of the muscle whose EMG envelope is drawn; None: no EMG.
     """
 

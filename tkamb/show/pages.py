@@ -25,7 +25,6 @@ def render(package: str, name: str, **values: Any) -> str:
 
     Args:
         package: package with the template, for example "tkamb.show".
-        name: file name in the folder `assets` of the package.
         values: values of the names in the template. A missing value raises an error.
     """
     pages = environment(package, True)

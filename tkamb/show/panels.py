@@ -47,7 +47,6 @@ class Line:
 
     Args:
         name: name of the curve, unique in its panel; often the name of its column.
-        label: name in the legend.
         values: (f,) values in the unit of the panel.
         colour: colour of the curve, "#rrggbb".
         dashed: whether the curve is dashed.
@@ -72,11 +71,7 @@ class Panel:
     """One plot.
 
     Args:
-        name: id of the plot in the page.
-        title: title of the plot.
         unit: unit of the vertical axis.
-        lines: curves of the plot.
-        note: text under the plot.
         level: (value, label) of a horizontal reference line; None: no line.
         span: (low, high, label) of a shaded range behind the curves; None: no range.
         second: (factor, unit) of a second vertical axis on the right; None: no second axis.

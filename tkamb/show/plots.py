@@ -68,10 +68,6 @@ class Sheet:
 
     Axes and ticks are reused, because they take most of the time of a plot. A plot that
     `_place_alone` cannot place has a separate figure.
-
-    Args:
-        axis: horizontal axis of every plot.
-        width: width of the figure, inches.
     """
 
     def __init__(self, results: "Results", axis: HorizontalAxis, width: float = WIDTH) -> None:

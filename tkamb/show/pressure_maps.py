@@ -213,8 +213,6 @@ def place_maps(figure: Figure, down: int, across: int, gap: float) -> tuple[list
 
     Args:
         figure: empty figure.
-        down: number of rows.
-        across: number of maps in a row.
         gap: distance between maps and colour bar, points.
     """
     figure.set_layout_engine("none")

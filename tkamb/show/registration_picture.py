@@ -31,7 +31,6 @@ def draw_registration(
 
     Args:
         model: segments with the model's markers.
-        found: the registration of these segments.
     """
     with settings():
         figure = new_figure(10.0, 6.0)

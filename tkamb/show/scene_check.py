@@ -44,7 +44,6 @@ class Entry:
     Args:
         part: name of the part, mostly the name of its table.
         file: file of the part; None: the scene file.
-        found: content of the part in words.
     """
 
     part: str
@@ -252,9 +251,6 @@ class SceneCheck:
 
     Args:
         entries: content of each file and table.
-        not_modelled: names of parts that the scene leaves out.
-        questions: unlikely values, with the likely mistake.
-        answered: lines on questions that the scene answers.
         missing: messages on packages that a run needs and that are not installed.
     """
 

@@ -57,9 +57,6 @@ def write_results_storage(results: "Results", path: Path) -> str:
     A missing number is `nan`. The column `status` has numbers instead of words: 0 is "ok", 1 a
     frame to be read with care, 2 a failed frame.
 
-    Args:
-        path: path of a new file, .sto or .mot.
-
     Returns:
         A line of text with the numbers of frames and columns.
 

@@ -44,12 +44,9 @@ class Bar:
     """One design in one plot.
 
     Args:
-        place: label on the horizontal axis.
         series: label in the legend; "": no label.
-        mean: mean over the runs.
         low: smallest value of the runs.
         high: largest value of the runs.
-        least: lower end of the uncertainty.
         most: upper end of the uncertainty.
     """
 

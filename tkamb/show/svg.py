@@ -67,7 +67,6 @@ def overhang(axis: Axis, length: float) -> tuple[float, float]:
     """Return how far tick labels of a horizontal axis extend past its left and right end, points.
 
     Args:
-        axis: horizontal axis.
         length: length of the axis, points.
     """
     labels = shown_labels(axis)
@@ -123,12 +122,7 @@ class Renderer(RendererSVG):
 
 
 def written(figure: Figure, dpi: int) -> str:
-    """Return a figure as an SVG document in points.
-
-    Args:
-        figure: figure before its layout.
-        dpi: resolution of rasterized parts.
-    """
+    """Return a figure as an SVG document in points."""
     buffer = io.StringIO()
     FigureCanvasSVG(figure)  # the layout engine measures with this canvas
     figure.set_dpi(72)
@@ -154,7 +148,6 @@ def text_width(text: str, size: float) -> float:
     """Return the width of a line of text, points. Call it within `style.settings`.
 
     Args:
-        text: line of text.
         size: size of the letters, points.
     """
     return _text_size(text, FontProperties(size=size), False)[0]

@@ -38,7 +38,6 @@ class Change:
 
     Args:
         keys: dotted key of the scene -> value that replaces the shipped one.
-        every: stride of the frames that stay in the recordings.
     """
 
     keys: dict[str, Any] = field(default_factory=dict)
@@ -79,7 +78,6 @@ class BodyRow:
     """Cost and effect of one change.
 
     Args:
-        name: name of the change.
         status: "ok", the error, or the number of failed frames.
         prepare_seconds: time of the run outside its frames, s.
         frame_seconds: median time per frame, s.

@@ -85,7 +85,6 @@ def run_calculix(text: str, longest: float = LONGEST_SECONDS) -> PeerRun:
     """Run CalculiX on an input deck.
 
     Args:
-        text: input deck.
         longest: time limit, s.
 
     Raises:
@@ -171,7 +170,6 @@ class PeerAnswer:
 
     Args:
         result: contact result on the contact nodes of the lattice's grid.
-        run: output and cost of the process.
         prepare_seconds: time to make the grid, the initial guess and the deck, s.
         nodes: number of nodes of the insert.
         balance: sum of the vertical contact forces, divided by the load.
@@ -190,7 +188,6 @@ def measure_by_calculix(
     """Return cost and results of CalculiX on a case; after an error only the status.
 
     Args:
-        case: contact problem.
         grid_mm: edge length of the hexahedra, mm.
         longest: time limit, s.
     """

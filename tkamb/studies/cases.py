@@ -42,7 +42,6 @@ def balls(
         apart: z of the lateral centre, m; the medial one is at -apart. 0: a single spheroid.
         waist: frontal radius of curvature at the lowest point over the sagittal radius.
         finest_deg: angle between the rings of vertices near the lowest point, deg.
-        sectors: number of vertices of a ring.
     """
     vertices, faces = _ball(radius, waist, finest_deg, sectors)
     if apart == 0:
@@ -61,7 +60,6 @@ def block(
         height: height of the upper surface, m, as a function of the arrays x and z, m.
         size: lengths along x and z, m.
         spacing: distance between the vertices of the upper surface, m.
-        name: name of the surface.
     """
     x, z = (np.linspace(-s / 2, s / 2, max(3, round(s / spacing) + 1)) for s in size)
     gx, gz = np.meshgrid(x, z, indexing="ij")
@@ -151,7 +149,6 @@ class StudyCase:
     """One contact problem.
 
     Args:
-        label: description in one line.
         pose: pose_femoral_in_insert, shape (4, 4); its y has no effect.
         load: force along -y, N.
         sphere: dimensions, if the case is a sphere on a linear layer.

@@ -37,15 +37,9 @@ class Extreme:
         nu: Poisson's ratio of the insert.
         modulus_MPa: Young's modulus of the insert, MPa.
         linear: whether Hooke's law replaces Ramberg-Osgood.
-        radius_mm: sagittal radius of the condyles.
-        waist: frontal radius of the condyles over the sagittal radius.
         conformity: radius of the condyles over the radius of the dishes; 0: a flat insert.
         apart_mm: half the distance between the condyles; 0: a single condyle.
-        ap_mm: anterior position of the femoral component.
-        ml_mm: lateral position of the femoral component.
         bearing: "fixed" or "mobile".
-        rough_mm: standard deviation of the noise on the femoral vertices.
-        facet_deg: angle between the rings of femoral vertices.
         shape: shape of the bodies, see `Shape`.
     """
 

@@ -27,7 +27,6 @@ class KeptRows:
     """The stored rows in the folder of a study.
 
     Args:
-        directory: folder of the study.
         resume: whether to use the rows of an earlier study in the folder. Otherwise they are
             deleted.
 
@@ -46,12 +45,7 @@ class KeptRows:
         return self._rows.get(key)
 
     def read(self, key: str, kind: type[T]) -> T | None:
-        """Return the row with a key as an object; None if there is no such row.
-
-        Args:
-            key: key of the row, see `row_key`.
-            kind: dataclass of the row.
-        """
+        """Return the row with a key as an object; None if there is no such row."""
         if key not in self._rows:
             return None
         with undamaged(self.path, "remove the file, or leave out resume=True"):

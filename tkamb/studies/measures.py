@@ -176,7 +176,6 @@ class Measure:
         warm_seconds: median time of a press at the next pose with a warm start, s.
         peak_rss_MB: peak memory of the process, MB.
         iterations: number of iterations of the first press.
-        nodes: number of nodes that the model solves for.
         values: quantities of the first press, see `quantities`.
         map: "i j" -> pressure, Pa, on a raster of 1 mm.
     """

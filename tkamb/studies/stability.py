@@ -87,7 +87,6 @@ def run_stability(
     Args:
         longest: processor time limit of a case, s. The verdict does not depend on other processes.
         kept: stored verdicts of earlier studies. They are not computed again; new ones are added.
-        workers: number of cases that run at the same time.
     """
     judges, stored = _Judges(longest, kept), stored_verdicts()
     # Threads, and the processes that they start, leave Ctrl-C to this process, which stops them.

@@ -55,7 +55,6 @@ class Row:
     """Cost and errors of one model on one case.
 
     Args:
-        measure: times, memory and results.
         errors: name of `KEYS` -> error relative to the reference; empty if the job failed.
         floor: largest relative uncertainty of the reference among `FRONT_ERRORS`.
         on_front: whether the row is on the Pareto front of its case.
@@ -259,7 +258,6 @@ def run_tradeoff(
     """Measure the jobs and yield one row per job. The Pareto fronts are not yet marked.
 
     Args:
-        jobs: models and cases to measure.
         references: case name -> reference.
         rows: stored measures of earlier studies. They are not repeated; new ones are added.
     """
@@ -317,10 +315,8 @@ def references_for(
     """Return case name -> reference. Those of a user's scene are computed and stored in `rows`.
 
     Args:
-        cases: contact problems.
         recompute: whether to compute and store the references again.
         announce: function that prints a line before a reference is computed.
-        rows: stored rows of earlier studies.
 
     Raises:
         InputError: a stored reference is missing, or belongs to an earlier version of its case.

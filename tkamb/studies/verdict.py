@@ -67,7 +67,6 @@ def complaints(result: ContactResult, load: float, solved: bool, source_rule: bo
     """Return one line for each check that a result fails.
 
     Args:
-        result: contact result with status ok.
         load: force along -y, N.
         solved: whether the gaps are those of deformed nodes. Otherwise penetration and peak
             pressure are not checked.
@@ -158,8 +157,6 @@ class Verdict:
     """Verdict on a case.
 
     Args:
-        case: label of the case.
-        kind: one of `KINDS`.
         reason: reason of a verdict other than converged, or the flags of the result.
         error: largest relative difference from the reference; None without a comparison.
         seconds: time of preparation and press without the reference, s.

@@ -91,8 +91,6 @@ class Got:
     """Result of fetching a data set.
 
     Args:
-        kept: names of files that existed already.
-        written: names of new files.
         absent: names of files that were not found.
     """
 
@@ -105,7 +103,6 @@ def download(dataset: Dataset, to: Path, url: str | None = None) -> Got:
     """Download the missing files of a data set.
 
     Args:
-        dataset: the data set.
         to: its folder; it is made if it does not exist.
         url: address of a mirror with the same paths; None: the data set's own address.
 
@@ -138,9 +135,7 @@ def take_from(dataset: Dataset, to: Path, folder: Path) -> Got:
     """Copy the missing files of a data set from a folder of downloads or a clone.
 
     Args:
-        dataset: the data set.
         to: its folder; it is made if it does not exist.
-        folder: folder with the files, see `DataFile.places`.
 
     Returns:
         Names of the files. A file that is not in the folder counts as absent.

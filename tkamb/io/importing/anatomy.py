@@ -29,9 +29,7 @@ class Leg:
         hip: the joint above the femur.
         femur: names of the femur and of the bodies welded to it, the femur first.
         tibia: names of the tibia and of the bodies welded to it, the tibia first.
-        foot: names of the bodies below the ankle.
         patella: name of the patella; None if the model has no patella.
-        pelvis: name of the body above the hip.
         neutral: body -> (4, 4) pose in ground in the neutral position. There the knee flexion is
             zero, and all other coordinates have their default values.
     """

@@ -15,7 +15,6 @@ class ExternalForce:
     """A force in a list of external loads.
 
     Args:
-        body: name of the body on which it acts.
         beginnings: "force", "point" or "moment" -> beginning of the names of its columns.
     """
 

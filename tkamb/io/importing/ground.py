@@ -67,8 +67,6 @@ def find_ground(request: ImportRequest, leg: Leg, axes: str, feet: Feet | None) 
     """Return the ground reaction of one foot.
 
     Args:
-        request: the recording, table, plates and interval.
-        leg: the leg of the foot.
         axes: axes of the recording and table that point forward, up and right.
         feet: positions of the feet; None: unknown.
 
@@ -366,9 +364,7 @@ def check_clocks(forces: list[RecordedForce], feet: Feet, side: str, path: Path)
 
     Args:
         forces: the forces of this foot, in the laboratory.
-        feet: positions of the feet.
         side: side of the foot, "left" or "right".
-        path: file of the forces, for the message.
     """
     time, point = _loaded_points(forces)
     middle = feet.middles[side]

@@ -275,9 +275,6 @@ def link_inertias(links: Links, scale: float) -> dict[str, RigidInertia]:
     """Return name of a link -> its inertia in the link's frame.
 
     The tibia link includes the foot, with the ankle at its neutral angle.
-
-    Args:
-        scale: factor on masses and inertias.
     """
     leg = links.leg
     groups = {
@@ -304,7 +301,6 @@ def patient_urdf(links: Links, scale: float, comment: str) -> str:
 
     Args:
         scale: factor on the model's masses.
-        comment: comment at the top of the file.
     """
     leg = links.leg
     inertias = link_inertias(links, scale)

@@ -38,10 +38,6 @@ def with_registered_markers(
     Without `request.register` the markers are registered if they misfit the model. The registration
     is None if they are not.
 
-    Args:
-        scene: content of the scene, with markers.
-        request: the import.
-
     Raises:
         InputError: a trial cannot be read, or the registration fails.
     """

@@ -42,9 +42,6 @@ def model_segments(
 ) -> list[ModelSegment]:
     """Return the segments with at least three markers: shank, thigh, and possibly foot, pelvis.
 
-    Args:
-        without: labels of markers to leave out.
-
     Raises:
         InputError: shank or thigh has fewer than three markers in the recording.
     """
@@ -74,9 +71,6 @@ def seen_segments(
     links: Links, recorded: Table, without: Sequence[str] = ()
 ) -> dict[str, ModelSegment]:
     """Return shank, thigh, foot and pelvis with the markers that are visible in any frame.
-
-    Args:
-        without: labels of markers to leave out.
 
     Raises:
         InputError: the recording has no marker with a label from `without`.
@@ -273,7 +267,6 @@ def feet(leg: Leg, recorded: Table, other: str) -> dict[str, list[str]]:
     """Return side -> labels of the foot's markers, [] for a foot that the model lacks.
 
     Args:
-        leg: the leg of one side.
         other: the other side, "left" or "right".
     """
     labels = recorded_labels(recorded)

@@ -60,9 +60,7 @@ class ImportedPatient:
     """The result of an import.
 
     Args:
-        urdf: text of patient.urdf.
         motion: text of motion.csv; None: the scene reads the recorded motion.
-        report: lines on the files read and the assumptions made.
         ground: text of ground_reaction.csv; None: the scene reads the recorded forces, if any.
         registration: registered markers; None: their positions are the model's or of a standing
             trial.
@@ -80,10 +78,6 @@ class ImportedPatient:
 
 def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
     """Return a patient's URDF and scene.
-
-    Args:
-        request: the files and options of the import.
-        folder: folder in which the scene will be written.
 
     Raises:
         InputError: a file or value cannot be used.
@@ -199,9 +193,6 @@ def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[st
 
     Existing files do not change. Scenes may share a file with the same content. If an error occurs,
     all new files are removed.
-
-    Args:
-        patient: the result of the import.
 
     Raises:
         InputError: the folder cannot be written, a file of the same name has another content, or

@@ -338,7 +338,6 @@ def own_plates(
 
     Args:
         side: "left" or "right".
-        hint: advice in messages.
 
     Raises:
         InputError: no plate was under the foot, or both feet stood on one plate.

@@ -69,7 +69,6 @@ def shank_markers(
     Args:
         segments: name of a segment -> its visible markers.
         femur: poses of the femur's body in the tibia link, m, shape (n, 4, 4).
-        recording: the file of the markers.
         axes: axes of the file that point forward, up and right.
 
     Raises:

@@ -14,21 +14,17 @@ class ImportRequest:
     """The files and options of an import. None: the option is inferred or not used.
 
     Args:
-        model: the .osim file.
         side: side of the knee, "left" or "right".
-        mass_kg: mass of the subject.
         recording: .c3d or .trc file of markers, or .mot or .sto file of the model's coordinates.
         grf: table of ground reactions, used instead of a C3D file's plates.
         grf_force: names of the foot's forces in the table `grf`, separated by commas. A force's
             name is the common beginning of its column names.
         poses: recorded poses of the femoral component in the insert. The markers then give only
             the shank's pose.
-        without: labels of markers to leave out.
         static: recording of a standing trial, which calibrates the markers' positions.
         register: whether the markers' positions are found together with the motion; None: if they
             misfit the model.
         companions: recordings of the same subject and markers that take part in the registration.
-        meshes: meshes of the implant.
         knee: name of the femorotibial joint.
         frames: part of the implant -> name of its mesh's frame in the model.
         plates: numbers of the plates under the foot; (): no ground reaction.

@@ -25,7 +25,6 @@ class Meshes:
     """Files of the implant's meshes, with their unit and their axes.
 
     Args:
-        femoral: mesh of the femoral component.
         insert: mesh of the insert.
         patella: mesh of the patellar button; None without a button.
         unit: "m", "cm", "mm" or "inch".
@@ -47,7 +46,6 @@ class GroundFile:
 
     Args:
         axes: axes of the file that point forward, up and right.
-        plates: numbers of the plates under the foot.
         columns: (role, name) of each column of a table.
         length_unit: unit of lengths in the table; None: the unit that the file states.
         surface: height of the step under the foot above its plates, m; 0: no step.
@@ -71,7 +69,6 @@ class MarkerFile:
 
     Args:
         axes: axes of the file that point forward, up and right.
-        segments: segments with their markers.
         method: fit of the markers, "segments" or "chain".
         knee: joint of the chain, "hinge" or "free".
         interval: start and end, s; None: the whole recording.
@@ -98,18 +95,13 @@ class SceneText:
     The motion comes from `markers` or `poses`, and from `motion.csv` if there is neither.
 
     Args:
-        title: comment lines at the top.
         folder: folder in which the scene will be written; paths in the scene are relative to it.
         side: side of the knee, "left" or "right".
-        mass_kg: mass of the subject.
-        urdf: name of the URDF file, in the same folder.
-        cutoff_Hz: cut-off frequency for markers and plates.
         markers: recording of markers for knee and shank, or None.
         poses: recorded poses of the femoral component, or None.
         shank: markers that give the shank's pose, or None; needed with `poses`.
         ground: the ground reaction, or None.
         meshes: meshes of the implant, or None.
-        tissue: muscles and ligaments.
         activity: activity whose published peaks the report shows; None: no peaks.
         model: the .osim file, if all its muscles act; None: only the quadriceps acts.
         coordinates: file of the model's coordinates; None: they are fitted to the markers.

@@ -42,7 +42,6 @@ class SoftTissue:
         quadriceps: origin and insertion; None without a patella or a vastus intermedius.
         patellar_ligament: ends on patella and tibia; None without a patellar ligament.
         ligament_length: length of the patellar ligament, m; NaN without a patellar ligament.
-        bundles: strands of the femorotibial ligaments.
         remarks: lines for the report on imported and omitted tissue, with reasons.
     """
 

@@ -46,9 +46,6 @@ def with_static_markers(
     """Return the scene with marker positions from a standing trial, and remarks on them.
 
     Args:
-        scene: content of the scene, with markers.
-        static: recording of the standing trial.
-        segments: segments with their markers.
         length_unit: unit of lengths in the trial; None: the unit that the file states.
     """
     assert scene.markers is not None
@@ -91,7 +88,6 @@ def calibrated_markers(
 
     Args:
         table: markers and joints of the scene. Markers that the trial lacks are ignored.
-        recorded: table of the standing trial.
         pose_insert_in_tibia: pose of the insert frame in the tibia link, shape (4, 4), mirrored
             for a left leg.
 

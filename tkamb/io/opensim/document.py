@@ -90,7 +90,6 @@ class Document:
         <connectors> with one <connectee_name> per socket. Version 3 has a tag per kind of socket.
 
         Args:
-            element: the element with the socket.
             name: name of the socket, such as "parent_frame".
             old_tags: tags of the socket in version 3.
             default: value for an unconnected socket; "": an unconnected socket is an error.

@@ -75,11 +75,7 @@ class Polynomial:
 
 
 class Piecewise:
-    """A piecewise polynomial with linear extrapolation beyond its ends.
-
-    Args:
-        pieces: polynomials between the knots.
-    """
+    """A piecewise polynomial with linear extrapolation beyond its ends."""
 
     def __init__(self, pieces: PPoly) -> None:
         self._value, self._slope = pieces, pieces.derivative()

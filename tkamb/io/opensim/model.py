@@ -84,10 +84,6 @@ class OpenSimMuscle:
     Args:
         name: the muscle's name.
         kind: the file's class, such as "Thelen2003Muscle".
-        path: path of the muscle.
-        max_isometric_force_N: maximum isometric force.
-        optimal_fibre_length_m: fibre length at the maximum isometric force.
-        pennation_rad: pennation angle at the optimal fibre length.
         max_contraction_velocity: maximum contraction velocity, optimal fibre lengths per second.
         enabled: whether the muscle is switched on in the file.
     """
@@ -113,7 +109,6 @@ class OpenSimLigament:
     Args:
         name: the ligament's name.
         kind: "Ligament" or "Blankevoort1991Ligament".
-        path: path of the ligament.
         slack_length_m: greatest length without force.
         stiffness_N: force per unit strain in the linear region, N; None for "Ligament".
         transition_strain: strain at the end of the toe region; None for "Ligament".
@@ -272,8 +267,6 @@ class Unread:
 
     Args:
         kind: the file's class.
-        name: name of the element.
-        reason: one line with the reason.
         concerns: names of the bodies and coordinates that occur in the element.
     """
 
@@ -308,7 +301,6 @@ class OpenSimModel:
         offset_frames: name of an offset frame -> its body, and its pose (4, 4) in that body.
         left_out: "class 'name'" of each element of the file that tkamb does not model.
         unread: elements that a partial reading could not read.
-        notices: lines on how the file was read.
         ground_axes: axes of the file's ground that point along this ground's x, y and z (forward,
             up, right), like "+x,+z,-y"; None: gravity is along none of the file's axes.
     """

@@ -46,7 +46,6 @@ class Frames:
     stored by owner and name.
 
     Args:
-        bodies: names of the bodies, including ground.
         offsets: (owner, frame) -> the frame's parent, and the frame's pose (4, 4) in the parent.
         unread: name of a frame -> reason for which it could not be read.
         upright: pose (4, 4) of the file's ground in a ground whose y points up.
@@ -86,7 +85,6 @@ class Frames:
         The pose in ground is that in the ground whose y points up.
 
         Args:
-            user: the element with the socket, for messages.
             socket: path or name of a frame, such as "/bodyset/tibia", "tibia", "tibia_offset" or
                 "/jointset/knee/tibia_offset".
             owner: joint with the frames that are searched first.

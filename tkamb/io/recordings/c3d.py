@@ -53,8 +53,6 @@ class Recording:
         channel_units: name -> unit, as in the file.
         plates: the readable force plates, in the file's order.
         faults: name of an unreadable part ("markers", "channels", "plate 2") -> its error.
-        equal_channels: names that several channels share.
-        notices: remarks on contradictions in the file.
         length_word: the file's word for its unit of length.
     """
 

@@ -202,7 +202,6 @@ def _parameters(
         content: bytes of the file.
         position: first byte of the chain of records.
         end: largest possible end of the chain, byte.
-        machine: code of the machine that wrote the file.
     """
     order = "big" if machine == _MIPS else "little"
     groups: dict[int, str] = {}

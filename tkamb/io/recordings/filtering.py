@@ -172,8 +172,6 @@ def check_frames(time: Array, cutoff_Hz: Cutoff, frames: int | None) -> None:
     solved patella, a rolling femur) are filtered at the rate of the frames.
 
     Args:
-        time: times of the frames.
-        cutoff_Hz: cut-off of the low-pass filter.
         frames: the scene's [motion] frames; None: the motion is not resampled.
     """
     if frames is None or cutoff_Hz == "none":

@@ -62,7 +62,6 @@ class PlateRecord:
         kind: type of the plate, 1 to 5.
         corners: (4, 3) m, corners of the surface.
         origin: (3,) m, the file's ORIGIN.
-        names: names of the channels.
         signals: (c, k) samples of the channels, in the file's units.
         units: units of the channels, as in the file.
         calibration: (6, c), matrix from channels to force and moment (types 4 and 5), or None.
@@ -70,7 +69,6 @@ class PlateRecord:
         metres_per_unit: metres per unit of length of the file.
         zero: samples in which the file states the plate as unloaded, or None.
         given: the user's units.
-        where: file and plate, for messages.
         moment_length: metres that stand for the length in moments, or in the points of type 1 and
             the ORIGIN of type 3; None: as the units state.
     """
@@ -100,7 +98,6 @@ class ForcePlate:
         corners: (4, 3) m, corners of the surface.
         force: (k, 3) N, on the foot; NaN where the file has no value.
         moment: (k, 3) N·m, on the foot, about the centre of the surface.
-        notices: remarks on how the plate was read.
     """
 
     number: int
@@ -169,7 +166,6 @@ def _in_possible_unit(
     is possible. A unit that the user gives is kept.
 
     Args:
-        record: the plate.
         force: (k, 3) N, as stated, in the plate's axes.
         moment: (k, 3) N·m about the surface's centre, as stated, in the plate's axes.
     """

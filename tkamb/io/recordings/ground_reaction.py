@@ -303,9 +303,7 @@ def check_under_foot(ground: GroundReaction, ankle: Array, path: Path) -> None:
     """Raise an InputError if the centre of pressure of the loaded foot is not under the foot.
 
     Args:
-        ground: the ground reaction.
         ankle: (f, 3) m, ankle centre in the laboratory at the same frames.
-        path: file of the ground reaction, for the message.
     """
     horizontal = (ground.point - ankle)[ground.loaded][:, [0, 2]]
     farthest = float(np.linalg.norm(horizontal, axis=1).max(initial=0.0))

@@ -97,11 +97,9 @@ class ChainFit(Generic[State]):
     """A chain fitted to markers.
 
     Args:
-        state: the fitted state.
         rms: (f,) m, root mean square of `distance`; NaN without markers.
         distance: (f, m) m, from each measured marker to the chain's; NaN for a missing marker.
         solved: (f,) whether the last step was below `STEP_TOLERANCE`.
-        steps: number of iterations.
     """
 
     state: State
@@ -119,7 +117,6 @@ def fit_chain(
     Args:
         measured: (f, m, 3) m, gaps NaN.
         weights: (m,) weights of the squared distances.
-        start: initial guess.
     """
     visible = np.isfinite(measured).all(axis=2)
     target, frame_weights = np.nan_to_num(measured), np.where(visible, weights, 0.0)

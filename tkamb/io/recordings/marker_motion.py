@@ -55,7 +55,6 @@ class MarkerKinematics:
 
     Args:
         time: (n,) s, times of the frames that `method` can fit, without a gap.
-        method: the fit that the scene chooses.
         tibia: (n, 4, 4) pose_tibia_in_laboratory by this fit.
         coordinates: (n, 6) knee coordinates by this fit.
         flexion: method -> (n,) rad; NaN in frames without a fit.

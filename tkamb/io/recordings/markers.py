@@ -104,7 +104,6 @@ def fit_rigid(points: Array, reference: Array, name: str = "the tibia") -> tuple
     Args:
         points: (n, m, 3) m, measured; frames with a gap give NaN.
         reference: (m, 3) m, the same markers in the body's frame.
-        name: name of the body, for the message.
 
     Returns:
         pose_body_in_world (n, 4, 4) and the root mean square distance (n,), m, between
@@ -138,7 +137,6 @@ def fit_seen(points: Array, reference: Array, weights: Array, name: str) -> tupl
         points: (n, m, 3) m, gaps NaN.
         reference: (m, 3) m.
         weights: (m,) weights of the squared distances.
-        name: name of the body, for the message.
 
     Returns:
         pose_body_in_world (n, 4, 4), and root mean square distance (n,) m of visible markers.

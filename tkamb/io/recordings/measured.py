@@ -185,8 +185,6 @@ def envelope(
 
     Args:
         signal: (n,) evenly spaced samples.
-        rate_Hz: sampling rate.
-        cutoff_Hz: cut-off of the low-pass after rectifying.
         high_pass_Hz: cut-off of the high-pass before rectifying; "none": only the mean is
             subtracted.
 

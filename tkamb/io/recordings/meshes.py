@@ -103,7 +103,6 @@ def load_surface(
     Args:
         unit: unit of length of the file, "m", "cm", "mm" or "inch".
         axes: axes of the file that point anterior, superior and to the right.
-        name: name of the part, for messages.
         closed: whether the surface must enclose a volume.
         size: smallest and largest plausible length, m.
 
@@ -291,9 +290,6 @@ def _check_stacked(
     """Raise an InputError if a part consists of bodies that lie on each other, like a tray.
 
     Args:
-        mended: the part.
-        wall: its inner wall.
-        name: name of the part.
         up: (3,) superior direction in the file's axes.
         unit: unit of the file.
     """

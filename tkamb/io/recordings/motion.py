@@ -79,7 +79,6 @@ class KneeMotion:
         cycle_percent: (f,) per cent of the cycle, if the motion is a cycle.
         closed_cycle: whether the cycle's ends agree, so that the filter is periodic.
         unrecorded: coordinates without a column; they are zero.
-        odd: samples off their neighbours' curve.
         markers: kinematics by skin markers, if the motion comes from markers.
     """
 

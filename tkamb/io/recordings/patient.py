@@ -41,7 +41,6 @@ class SegmentFractions:
     """Fractions of body mass and of segment length.
 
     Args:
-        mass: mass of the segment, share of body mass.
         centre: distance of its centre of mass from the proximal end, share of segment length.
         radii: radii of gyration about the sagittal (AP), transverse (ML) and longitudinal axis,
             shares of segment length.

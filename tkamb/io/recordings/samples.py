@@ -50,7 +50,6 @@ def odd_samples(
     """Return the odd samples of one quantity.
 
     Args:
-        what: the quantity, for messages.
         time: (n,) s, rising.
         values: (n,) SI.
         floor: smallest deviation of an odd sample, SI.

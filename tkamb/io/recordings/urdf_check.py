@@ -201,7 +201,6 @@ def check_chain(
 
     Args:
         robot: tree of a right leg, or of a mirrored left leg.
-        side: declared side of the knee, for messages.
         with_patella: whether the patella is required; if not, it is checked if present.
     """
     joints = {str(joint.get("name")): joint for joint in robot.findall("joint")}

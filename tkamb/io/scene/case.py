@@ -42,7 +42,6 @@ class Case:
     """The input of a run. Parts that are absent from the scene are None.
 
     Args:
-        chain: kinematic chain of the patient.
         motion: coordinates of the knee, and of a recorded patella, per frame.
         tibia: motion of the shank in the laboratory; None: the shank is upright and does not move.
         ground: ground reaction in the laboratory.
@@ -51,13 +50,9 @@ class Case:
         patella: patellar button in the patella link's frame.
         ligaments: the bundles, including generic ones; the slack length is NaN if the scene does
             not state it.
-        measured: forces that an instrumented implant measured.
-        emg: envelopes of the muscles' surface EMG.
         post: the insert's post in the insert frame, if the scene has [contact] post.
         insert_placement: pose of the insert's mesh in the insert frame, after the mesh is turned
             to anatomical axes about its origin, not mirrored, m, shape (4, 4); None if not needed.
-        patella_heads: heads of the quadriceps of a released patella.
-        patella_ligaments: strands and retinacula of a released patella.
     """
 
     scene: Scene

@@ -65,7 +65,6 @@ def rolling_motion(
     are filtered and differentiated like recorded coordinates, but never as a closed cycle.
 
     Args:
-        motion: recorded and filtered motion.
         femoral: femoral component, femoral frame.
         insert: insert, insert frame.
         slip_share: share of the recorded motion's mean slip of the condyles; 0 is pure rolling.

@@ -105,11 +105,7 @@ class Person:
 
 
 def write_person(folder: Path, person: Person) -> None:
-    """Adapt the starter's files in a folder to a person.
-
-    Args:
-        folder: folder with the files of `tkamb new`.
-    """
+    """Adapt the starter's files in a folder to a person."""
     urdf, scene = folder / "patient.urdf", folder / "scene.toml"
     urdf.write_text(patient_urdf(urdf.read_text(encoding="utf-8"), person), encoding="utf-8")
     scene.write_text(scene_text(scene.read_text(encoding="utf-8"), person), encoding="utf-8")

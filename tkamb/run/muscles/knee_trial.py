@@ -214,7 +214,6 @@ class LegRecording:
     """The files and options from which a leg and its muscles are read.
 
     Args:
-        model: path of the .osim file.
         coordinates: path of a .mot or .sto file of the model's coordinates; None: the coordinates
             are fitted to the markers.
         markers: path of a marker recording; None: no markers.
@@ -266,9 +265,6 @@ def load_knee_trial(source: LegRecording, time: Array) -> tuple[Links, KneeTrial
 
 def group_names(model: Path, side: Side) -> tuple[str, ...]:
     """Return the names of the muscle groups of a leg, see `muscle_groups`.
-
-    Args:
-        model: path of the .osim file.
 
     Raises:
         InputError: the model cannot be used.

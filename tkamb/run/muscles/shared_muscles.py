@@ -49,9 +49,6 @@ class SharedMuscles:
     Args:
         trial: optimisation problems and muscle lines of all frames.
         is_left: whether the leg is a left one. Its knee is computed as its mirror image.
-
-    Attributes:
-        trial: the argument.
     """
 
     def __init__(self, trial: KneeTrial, is_left: bool = False) -> None:
@@ -105,7 +102,6 @@ class FrameMuscles:
 
         Args:
             geometry: geometry of the knee, with contact points if contact is modelled.
-            friction: Coulomb coefficient of the femorotibial contact.
             lifted: sides without contact force.
         """
         try:

@@ -126,7 +126,6 @@ class Shared:
         own_multiplier: multipliers of the activations' bounds, positive at the upper bound, (n,).
         other_multiplier: multipliers of the bounds of y, 1/N or 1/(N·m), (m,).
         kkt_residual: relative violation of the optimality conditions, see `kkt_residual`.
-        steps: number of quadratic programmes.
     """
 
     activation: Array

@@ -105,7 +105,6 @@ class Bones:
         sums over all parts.
 
         Args:
-            bone: name of the bone with the attachments.
             towards: name of the other bone; None: any body outside the leg, such as the pelvis.
         """
         bone_index = self.index(bone)
@@ -159,7 +158,6 @@ class MuscleTrial:
         reserve: reserves r, N·m, (f, c).
         kkt_residual: relative violation of the optimality conditions, (f,).
         status: "ok" or "failed: …" for each frame.
-        bones: bones of the leg and their loads.
     """
 
     time: Array
@@ -222,7 +220,6 @@ def solve_trial(
     """Return the muscle forces of a leg in every frame of a motion.
 
     Args:
-        model: OpenSim model.
         motion: coordinates of the model over time, including locked ones.
         loads: name of a body -> external wrench on it, moment (N·m) first, force (N), in ground
             about its origin, (f, 6), such as the ground reaction on each foot. A frame with NaN

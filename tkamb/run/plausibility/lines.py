@@ -136,7 +136,6 @@ def strain_questions(
     """Ask about bundles that would tear, or are far from taut in all frames.
 
     Args:
-        ligaments: ligament bundles.
         strains: name of a bundle -> strain at the recorded poses, (f,).
         time: times of the frames, s, (f,).
     """

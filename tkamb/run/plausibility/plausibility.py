@@ -49,7 +49,6 @@ class Plausibility:
 
     Attributes:
         questions: questions without an answer in the scene.
-        answered: sentences with a question and its answer.
 
     Raises:
         InputError: an answer is empty, or belongs to no question.

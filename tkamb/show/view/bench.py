@@ -116,7 +116,6 @@ class BenchRequest:
             `axial_rotation_deg` is external rotation of the femur.
         ap_mm: anterior position of the femoral component, insert frame; `ml_mm` is lateral.
         load_N: axial load along the tibia, through the origin of the recorded insert frame, N.
-        femoral: placement of the femoral component on the femur.
         tibial: placement of the insert on the tibia.
         slack_percent: change of the slack lengths of all ligaments, %.
         released: names of the coordinates that are found by equilibrium.
@@ -228,12 +227,7 @@ def _released(values: Any) -> tuple[str, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """The parts of a case that no request changes.
-
-    Args:
-        case: case of a scene with [contact].
-        ligaments: ligaments of the case with their slack lengths.
-    """
+    """The parts of a case that no request changes."""
 
     case: Case
     ligaments: "tuple[Ligament, ...]"

@@ -46,8 +46,6 @@ def write_bench(case: Case, folder: Path, session: Path | None = None) -> Path:
     The URDF is copied. The scene holds the paths of meshes outside `session`.
 
     Args:
-        case: static case.
-        folder: existing folder. Files with the same names are replaced.
         session: folder with meshes of this session, which are copied; None: no mesh is copied.
     """
     scene, side = case.scene, -1.0 if case.scene.patient.side == "left" else 1.0
@@ -78,7 +76,6 @@ def write_motion(folder: Path, times: Sequence[float], coordinates: Array, side:
     """Write knee coordinates (f, 6) of a right knee to motion.csv, the [motion] file of `STILL`.
 
     Args:
-        folder: folder for motion.csv.
         times: times, s, shape (f,).
         coordinates: knee coordinates, m and rad, shape (f, 6).
         side: -1 for a left knee, because its ML axis is reversed; 1 for a right knee.
@@ -203,7 +200,6 @@ def write_knee(knee: Knee, placement: Array, coordinates: Array, folder: Path) -
     insert, as in `Knee.press`. The scene has no muscles, extensor mechanism or friction.
 
     Args:
-        knee: knee with both components and a contact model.
         placement: (4, 4) pose of the insert's mesh in the insert frame (`insert_placement`).
         coordinates: knee coordinates (f, 6) of a right knee. Only the first row is written.
         folder: empty folder.
@@ -240,7 +236,6 @@ def _bundles(knee: Knee, tibia: Array) -> "list[Ligament]":
     """Return the bundles between femur and tibia, with names that a scene accepts.
 
     Args:
-        knee: knee with ligaments.
         tibia: (4, 4) pose of the knee's tibia link in the tibia link of the scene.
     """
     bundles: list[Ligament] = []

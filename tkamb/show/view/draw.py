@@ -40,7 +40,6 @@ def draw(
     """Return the drawing of a run.
 
     Args:
-        run: case, recording and results that belong together.
         progress: function that wraps the frame indices, for example a progress bar.
         lattice: whether the cells of the lattice are drawn too.
     """

@@ -111,8 +111,6 @@ class Solid:
     """A rigid surface that moves.
 
     Args:
-        name: unique within the drawing.
-        layer: one of LAYERS.
         surface: surface in the solid's own frame.
         colour: colour "#rrggbb".
         opacity: opacity, 0 to 1.
@@ -135,8 +133,6 @@ class Strand:
     """A ligament, tendon or path: a tube along points.
 
     Args:
-        name: unique within the drawing.
-        layer: one of LAYERS.
         points: points of the centre line, m, shape (f, m, 3) or (1, m, 3). A point may be
             repeated: where the colour changes, and at the end of a path with fewer points.
 
@@ -156,7 +152,6 @@ class Arrow:
     """A force.
 
     Args:
-        name: name in the legend.
         colour: colour "#rrggbb".
         points: points of application, m, shape (f, 3).
         forces: forces, N, shape (f, 3).
@@ -177,8 +172,6 @@ class Marker:
     """A small ball.
 
     Args:
-        name: unique within the drawing.
-        layer: one of LAYERS.
         colour: colour "#rrggbb".
         points: centre of the ball, m, shape (f, 3).
         radius: radius of the ball, m.
@@ -219,7 +212,6 @@ class Reading:
     """One line of the numbers of a frame.
 
     Args:
-        name: name of the quantity.
         values: value with its unit as text, one per frame.
     """
 
@@ -239,13 +231,11 @@ class Drawing:
         times: times of the frames, s, shape (f,).
         statuses: status of each frame: "ok" or a sentence.
         readings: displayed numbers of every frame.
-        strands: ligaments, tendons and paths of centres of pressure.
         markers: contact points and centres of pressure.
         map: pressure map; None without contact.
         strain_limit: upper end of the ligaments' colour scale; 0 without ligaments.
         activation_limit: upper end of the muscles' colour scale; 0 without muscles.
         lattice: edges of the lattice's cells, m, shape (s, 2, 3); empty unless requested.
-        notes: sentences that help to interpret the drawing.
     """
 
     title: str

@@ -49,11 +49,6 @@ def force_arrows(
 
     The arrow of a condyle is its contact force on the insert, friction included. The two arrows
     add up to the contact force of results.csv.
-
-    Args:
-        results: results of the frames.
-        geometries: geometry of the same frames.
-        friction: coefficient of Coulomb friction of the femorotibial contact.
     """
     columns = {
         "ground reaction": _vector(results, "ground_reaction_{}_N"),

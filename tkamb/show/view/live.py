@@ -40,7 +40,6 @@ def parametric_insert(case: Case, folder: Path) -> Insert | None:
     The design is the file `DESIGN_FILE` beside the mesh. It must reproduce this mesh exactly.
 
     Args:
-        case: case with [contact].
         folder: folder for the mesh that is made for the comparison.
     """
     table = case.scene.implant.insert
@@ -74,7 +73,6 @@ def with_thickness(case: Case, insert: Insert, thickness_mm: float, folder: Path
     """Return a case with its parametric insert at another thickness.
 
     Args:
-        case: case with [contact].
         insert: design of its insert.
         thickness_mm: smallest thickness, mm.
         folder: folder for the mesh. It must exist as long as the case is used.
@@ -96,7 +94,6 @@ class LiveAnswer:
     """Answer to one request of the bench.
 
     Args:
-        request: the computed state.
         numbers: name with unit -> value; NaN: the value is not defined.
         status: "ok", flags in plain words, or "failed: " and the reason.
         pose: (4, 4) pose_femoral_in_insert; NaN if the state failed.
@@ -133,7 +130,6 @@ class LiveKnee:
     Only the latest request counts: `answer` raises an error for an older request.
 
     Args:
-        case: case of a scene with [contact].
         session: folder for the files of this session; None: a new folder. It is removed with this
             object. A saved scene has copies of the meshes in it.
 

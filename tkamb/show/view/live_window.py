@@ -61,7 +61,6 @@ class LiveWindow:
     """A knee on the bench, its page and the folder for saved scenes.
 
     Args:
-        knee: knee on the bench, which computes the answers.
         folder: folder for saved scenes, which are called kept-1, kept-2 and so on.
         frame: recorded frame at which the window opens.
 
@@ -92,7 +91,6 @@ class LiveWindow:
         Args:
             name: "live" computes a state. "save" computes it without an initial guess and writes
                 it as a scene.
-            content: a `BenchRequest` as JSON object.
 
         Raises:
             TkambError: the name is unknown, the state is impossible, or a newer request arrived.
@@ -340,7 +338,6 @@ def bench_of_knee(knee: Knee, q: Any) -> LiveKnee:
     """Return a knee on the bench.
 
     Args:
-        knee: knee with a named contact model.
         q: configuration (nq,), or configurations (f, nq) for the slider "recorded frame".
 
     Raises:

@@ -45,7 +45,6 @@ def check_film(path: Path, option: str) -> None:
 
     Args:
         path: path of the film, .gif or .mp4.
-        option: command-line option that asks for the film.
 
     Raises:
         InputError: the suffix is another one, or a browser or a package of the extra is missing.
@@ -65,7 +64,6 @@ def write_film(show: "Show", path: Path, progress: Progress = lambda frames: fra
     """Write a film of every frame at the speed of the motion.
 
     Args:
-        show: drawings of the runs.
         path: path of the film, .gif or .mp4.
         progress: function that wraps the frame indices, for example a progress bar.
 
@@ -183,7 +181,6 @@ def page_html(
     Args:
         packed: drawings (`tkamb.show.view.payload.pack`); None: a server sends them.
         frame: frame at which the page opens.
-        view: camera at the beginning.
         live: names of the contact models that the server offers; None without a server.
     """
     # The text of a script must not contain its closing tag.
@@ -228,7 +225,6 @@ def screenshot(html: str, size: tuple[int, int]) -> bytes:
     """Return a PNG of a self-contained page of `page_html`, without its controls.
 
     Args:
-        html: HTML of the page.
         size: width and height, pixels.
 
     Raises:

@@ -82,7 +82,6 @@ class Source:
     """Content of a path: results and their case, or a case that has not been run.
 
     Args:
-        path: folder that `tkamb run` wrote, or scene file.
         results: results of the case; None: it has not been run.
         kept: folder with the results of a scene file; None: no such folder, or `path` is a folder.
     """

@@ -63,7 +63,6 @@ class ContactSwitch:
     their current step.
 
     Args:
-        run: case with [contact], and its results.
         peak: top of the colour scale of the page, MPa.
 
     Attributes:
@@ -166,8 +165,6 @@ class ViewServer:
     without the token in their address.
 
     Args:
-        html: HTML of the page.
-        packed: compressed drawings.
         switch: source of results by other contact models; None: the page has only the drawings.
         port: port of the server; 0: any free port.
         bench: function that returns the answer to a request of `tkamb live` from its name and

@@ -30,9 +30,7 @@ class Show:
     """Drawings of one or more runs, shown side by side.
 
     Args:
-        runs: one or more runs.
         frame: frame at which the page opens.
-        camera: one of CAMERAS.
         lattice: whether the cells of the lattice are drawn too. The live window draws them when
             the user switches their layer on.
         progress: function that wraps the frame indices, for example a progress bar.

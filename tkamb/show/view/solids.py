@@ -275,8 +275,6 @@ def revolved(radius: Array, height: Array, name: str, sections: int = 28) -> Sur
     Args:
         radius: radii, m, shape (n,).
         height: increasing z of the radii, m, shape (n,).
-        name: name of the surface.
-        sections: number of sides of the approximated circle.
     """
     count, angle = len(radius), 2.0 * np.pi * np.arange(sections) / sections
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)

@@ -164,7 +164,6 @@ class CohortRun:
         labels: "subject", "trial", "activity", "design", "contact" -> name; "" for an axis without
             entries.
         overrides: dotted key of the scene -> value.
-        scene: scene with the overrides applied.
     """
 
     number: int
@@ -188,7 +187,6 @@ class Cohort:
     """A cohort file and the runs that it defines.
 
     Args:
-        table: validated content of the file.
         runs: all runs, sorted by subject, trial, design and contact in the order of the file.
     """
 
@@ -233,10 +231,6 @@ class Cohort:
 
 def load_cohort(path: str | Path, frames: str | None = None) -> Cohort:
     """Read a cohort file and the scene of every run. Meshes and recordings are not opened.
-
-    Args:
-        path: path of the cohort file.
-        frames: slice A:B:STEP that replaces `frames` of the file.
 
     Raises:
         InputError: the file or a scene cannot be used.

@@ -173,7 +173,6 @@ class Part:
 
     Args:
         index: number of the part, from 1 to `count`.
-        count: number of parts.
 
     Raises:
         InputError: the numbers are out of range.

@@ -36,7 +36,6 @@ class Group:
 
     Args:
         labels: axis of the cohort -> label that the runs share.
-        numbers: numbers of the r runs with results.
         axis: column that is divided into bins, "flexion_deg" or "cycle_percent".
         edges: edges of the b bins, in the unit of the axis, shape (b + 1,).
         bins: column -> mean of each run in each bin, shape (r, b); NaN for a bin without frames.
@@ -69,8 +68,6 @@ class Spread:
     """Statistics of a quantity over the runs of a group. The arrays have the shape of the quantity.
 
     Args:
-        runs: number of runs with a value.
-        mean: mean over these runs.
         sd: standard deviation with n - 1; NaN for fewer than two runs.
         low: smallest value.
         high: largest value.

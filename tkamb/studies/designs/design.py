@@ -56,7 +56,6 @@ class Articulation:
         Args:
             pose: pose_femoral_in_insert, mm, shape (4, 4).
             flexion: flexion, rad; the search begins at this angle of the femoral normal.
-            side: MEDIAL or LATERAL.
         """
         phi, z = flexion, side * self.femoral.ridge_half
         reach = np.array([PHI_REACH, Z_REACH])
@@ -113,7 +112,6 @@ class Design:
     """One implant.
 
     Args:
-        title: description of the modelled implant.
         bearing: "fixed" or "mobile".
         symmetric: whether both condyles have the same J-curve.
         articulation: femoral component and insert, mm.

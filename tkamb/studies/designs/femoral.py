@@ -41,13 +41,7 @@ Ids = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Cam:
-    """A cylinder along z across the box of a femoral component; mm, femoral frame.
-
-    Args:
-        centre_ap: x of the axis.
-        centre_si: y of the axis.
-        radius: radius of the cylinder.
-    """
+    """A cylinder along z across the box of a femoral component; mm, femoral frame."""
 
     centre_ap: float
     centre_si: float
@@ -227,18 +221,11 @@ class FemoralComponent:
         medial_arcs: arcs (from, to, radius) of the medial J-curve.
         lateral_arcs: arcs of the lateral J-curve.
         origin_phi: angle of a normal. The centre of the medial arc with this normal is the origin.
-        coronal_radius: coronal radius of the condyles at the ridges.
-        ridge_half: ML distance of the ridges from the middle.
         ridge_half_at_flange_top: ML distance of the ridges at the top of the flange.
         groove_radius: radius of the trochlear groove, which is tangent to both condyles.
-        width_half: half the outer width.
         width_half_at_flange_top: half the outer width at the top of the flange.
         taper_phi: angles of the normals between which ridges and outer edges widen.
-        edge_fillet: radius of the rounded outer edge.
         notch_phi: angles of the normals at which the notch (or box) begins and has its full width.
-        notch_half: half the width of the notch.
-        notch_fillet: radius of the rounded edge of the notch.
-        thickness: thickness of the component.
         blend_half: ML distance from the middle within which unequal J-curves blend.
         cam: cam of a posterior-stabilised component; None: no cam.
     """

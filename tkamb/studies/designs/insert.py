@@ -23,11 +23,7 @@ class Post:
     """A posterior-stabilising post; mm, insert frame.
 
     Args:
-        posterior: AP position of the posterior face at the base.
-        anterior: AP position of the anterior face at the base.
-        half_width: half the ML width at the base.
         height: height above the lowest points of the dishes.
-        corner_radius: radius of the corners of the outline.
         draft: distance by which the faces lean inwards between base and top.
     """
 
@@ -61,16 +57,11 @@ class Insert:
         medial_dish_radii: sagittal radii of the medial dish, anterior and posterior to its lowest
             point.
         lateral_dish_radii: sagittal radii of the lateral dish, in the same order.
-        coronal_radius: coronal radius of both dishes.
         thickness: smallest thickness.
         low_point_ap: anterior position of the lowest points of both dishes.
         dish_half: ML distance of the lowest lines of the dishes from the middle.
         eminence_height: height of the eminence above the lowest points of the dishes.
-        depth_half: half the AP depth.
-        width_half: half the ML width.
-        notch_depth: depth of the posterior notch.
         notch_width: half the ML width of the notch where its depth has fallen to 37 %.
-        edge_fillet: radius of the rounded edge.
         post: posterior-stabilising post; None: no post.
     """
 

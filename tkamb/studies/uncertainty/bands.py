@@ -217,8 +217,6 @@ def measured_inside(
     """Return the share of frames in which each measured force lies within its band.
 
     Args:
-        columns: columns of results.csv, including `measured_<name>_N`.
-        bands: columns of bands.csv.
         compared: force -> its comparison, as in `measured` of the summary.
 
     Returns:
@@ -244,7 +242,6 @@ class Influence:
     """Influence of one input on one result.
 
     Args:
-        result: column of results.csv.
         name: name of the input, or "rest" for variance that no function of one input explains.
         share: share of the variance of the result, summed over all frames.
         change: linear change of the result per standard deviation of the input, at the frame of the
@@ -277,7 +274,6 @@ def influences(
 
     Args:
         results: names of the m results.
-        inputs: names of the d inputs.
         values: values of the samples, shape (n, m, f); NaN for a missing value.
         errors: errors of the inputs in standard deviations, shape (n, f, d).
 

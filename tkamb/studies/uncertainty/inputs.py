@@ -30,7 +30,6 @@ class VariedInput:
     """One input that varies.
 
     Args:
-        name: name of the input in the tornado table.
         deviation: standard deviation of the input, in `unit`.
         unit: unit of the deviation: "mm", "deg", "relative", or "1" for a number without unit.
     """
@@ -197,7 +196,6 @@ class Draw:
     """The errors of the inputs in one sample.
 
     Args:
-        inputs: the d varied inputs.
         normal: standard normal value of each input, shape (d,).
         noise: standard normal value of each of the p pose inputs at each frame, shape (f, p).
         constant_share: share of the variance of a pose error that is constant over the frames.

@@ -145,11 +145,8 @@ class Uncertainty:
     """Result of `estimate_uncertainty`.
 
     Args:
-        results: nominal results. Their summary lists the varied inputs.
         bands: name -> column of bands.csv.
         tornado: influence of each input on each result.
-        names: columns of results.csv that have a band.
-        inputs: varied inputs.
         samples: samples in the order of their numbers. Those of Saltelli's design that are not
             independent come last.
         indices: Sobol' indices; empty if they were not requested.
@@ -195,7 +192,6 @@ def estimate_uncertainty(
             `samples` (d + 2) samples are computed, and the bands use 2 `samples` of them.
         frames: slice of the frames; default: all.
         directory: folder for all results; None: results stay in memory.
-        scene_path: path of the scene file, for the summary.
         resume: whether to use the samples that an interrupted run stored in the folder.
         force: whether to write into a folder that contains files of other programs.
         progress: wrapper of the iterator of the finished samples.

@@ -262,10 +262,6 @@ def displaced_by_markers(case: Case, draw: Draw) -> "tuple[BodyMotion | None, Ar
     """Return shank motion and knee coordinates (f, 6) with the errors of the markers.
 
     Only coordinates that are computed from the markers change.
-
-    Args:
-        case: the nominal case.
-        draw: errors of the inputs, including `marker.<label>`.
     """
     markers, tibia, coordinates = case.scene.motion.markers, case.tibia, case.motion.coordinates
     if (
@@ -320,14 +316,8 @@ class Sample:
 class Sampler:
     """Computes samples of one scene.
 
-    Args:
-        frames: numbers of the frames to compute.
-        names: requested columns of results.csv.
-
     Attributes:
-        names: requested columns.
         case: nominal case. It contains only the frames to compute if `thinnable` allows it.
-        inputs: varied inputs.
 
     Raises:
         TkambError: the scene is invalid.
@@ -407,11 +397,7 @@ class Sampler:
 
 
 class BandWorker:
-    """Computes samples in a worker. It can be prepared before the column names are known.
-
-    Args:
-        frames: numbers of the frames to compute.
-    """
+    """Computes samples in a worker. It can be prepared before the column names are known."""
 
     def __init__(self, scene: Scene, frames: range) -> None:
         self._scene, self._frames = scene, frames

@@ -33,10 +33,6 @@ ROUNDING = 1e-10
 def correlation_root(tables: Sequence[CorrelationTable], names: Sequence[str]) -> Array:
     """Return the Cholesky factor L (d, d) of the correlation matrix of the inputs.
 
-    Args:
-        tables: pairs of correlated inputs. All other pairs are uncorrelated.
-        names: names of the d varied inputs.
-
     Raises:
         InputError: an input does not vary, a pair occurs twice, or the coefficients contradict
             each other.
@@ -147,7 +143,6 @@ def normal_samples(method: str, count: int, dimensions: int, seed: int) -> Array
     Args:
         method: sampling method, "lhs" or "sobol".
         count: number of samples, at least 1.
-        dimensions: number of inputs.
         seed: seed of the random numbers.
 
     Raises:
@@ -180,8 +175,6 @@ def noise_of_point(
     """Return the noise (f, p) of some inputs at a point.
 
     Args:
-        point: point of the sample.
-        columns: numbers of the p inputs that have noise.
         time: increasing times of the frames, s, shape (f,).
         correlation_time: correlation time of the noise, s.
         seed: seed of the random numbers.
@@ -202,9 +195,7 @@ def noise(number: int, time: Array, dimensions: int, correlation_time: float, se
     The noise is stationary for any time steps.
 
     Args:
-        number: number of the sample.
         time: increasing times of the frames, s, shape (f,).
-        dimensions: number of independent series.
         correlation_time: correlation time tau, s; 0: white noise.
         seed: seed of the random numbers.
     """

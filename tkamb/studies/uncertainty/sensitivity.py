@@ -29,8 +29,6 @@ class SobolIndex:
     """Share of an input in the variance of a result.
 
     Args:
-        result: column of results.csv.
-        name: name of the input.
         first: first-order index, the share of the input alone: Var(E(y | x_i)) / Var(y).
         first_error: standard error of the first-order index.
         total: total index, which includes all interactions: E(Var(y | all but x_i)) / Var(y).
@@ -65,7 +63,6 @@ def sobol_indices(
 
     Args:
         results: names of the m results.
-        inputs: names of the d inputs.
         values: values of the samples, shape (n (d + 2), m, f), in the order of
             `tkamb.studies.uncertainty.sampling.crossed_points`.
         count: number n of rows of the design.
@@ -135,12 +132,9 @@ class Screened:
     """Effect of one input on one result at the frame where the result is largest.
 
     Args:
-        result: column of results.csv.
         nominal: largest nominal value of the result.
         flexion: flexion of the frame with this value, deg.
-        varied: the input.
         minus: change at this frame for minus one standard deviation; NaN if the frame failed.
-        plus: change for plus one standard deviation.
     """
 
     result: str

@@ -59,7 +59,6 @@ def varied_wear_inputs(
     """Return the varied inputs of a wear simulation.
 
     Args:
-        table: table [uncertainty] of the scene.
         motion: motion of the cycle. Coordinates in equilibrium have no error of their own.
         creep: creep law; None: creep is not modelled.
         profile: whether the motion is a simulator's profile. Its pose then varies only by stated
@@ -119,7 +118,6 @@ class WearSampler:
 
     Args:
         simulation: nominal case, number of cycles, and number of updates of the geometry.
-        inputs: the d varied inputs.
         constant_share: share of the variance of a pose error that is constant over the frames.
     """
 
@@ -180,7 +178,6 @@ class WearBands:
     """5th, 50th and 95th percentile of the samples of a wear simulation.
 
     Args:
-        varied: varied inputs.
         failed: number of samples without contact. The bands exclude them.
         ended: number of samples that ended before the last cycle. Later bands exclude them.
         rows: for each row of the table "<column>_p05", "_p50" and "_p95" -> percentile; NaN with
@@ -235,7 +232,6 @@ class Sampling:
     """The samples of a wear simulation. Sample n does not depend on the number of samples.
 
     Args:
-        inputs: the d varied inputs.
         root: Cholesky factor of the correlation matrix, shape (d, d), see
             `tkamb.studies.uncertainty.sampling`.
         seed: seed of the random numbers.
@@ -274,7 +270,6 @@ class Sampling:
 
         Args:
             simulation: nominal case, number of cycles, and number of updates of the geometry.
-            rows: rows of the nominal table.
             crew: worker pool settings; default: this process.
             shards: store of the finished samples; None: they stay in memory.
             progress: wrapper of the iterator of the finished samples.

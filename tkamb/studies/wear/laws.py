@@ -293,7 +293,6 @@ def wear_law(name: str, parameters: Mapping[str, Any], where: object = None) -> 
     Args:
         name: name of the law, one of `law_names()`.
         parameters: parameter -> value, for all parameters of the law.
-        where: file or material of the parameters, for messages.
 
     Raises:
         InputError: the law is unknown, a parameter is missing or unknown, or a value is invalid.

@@ -32,7 +32,6 @@ class LogarithmicCreep:
     Args:
         compliance_per_MPa: c, strain at the reference time, 1/MPa.
         per_decade_per_MPa: b, strain per tenfold time, 1/MPa.
-        reference_min: reference time t_ref, min.
     """
 
     compliance_per_MPa: float
@@ -95,7 +94,6 @@ class WearMaterial:
         creep: creep law; None: creep is not modelled.
         factor_range: lowest and highest factor on the worn depth within the uncertainty of the
             sources.
-        range_source: source of this range.
     """
 
     name: str

@@ -62,13 +62,11 @@ class CycleMotion:
         load: load along -y, N, shape (f,).
         duration: duration of a cycle, s.
         passes: passes through the frames per cycle: 2 for a motion there and back, else 1.
-        notes: notes on the cycle for the report.
         drive: loads from which equilibrium on each insert gives the poses. `poses` are then initial
             guesses. None: the poses are prescribed.
         seconds: duration of each step in one pass, s, shape (f - 1,); None: equal steps.
         path: poses at and between the frames; None: a screw motion from frame to frame.
         closing: closing of the recorded frames to a cycle; "" for a simulator's profile.
-        questions: questions on the cycle for the report.
     """
 
     poses: Array
@@ -109,7 +107,6 @@ class CycleMotion:
             time: times of the frames, s, shape (f,).
             poses: pose_femoral_in_insert, shape (f, 4, 4); NaN for a failed frame.
             load: load along -y, N, shape (f,); NaN for a failed frame.
-            closing: see above.
             interval: duration of the screw motion, s; None: the mean interval between the frames.
             track: times, s, shape (g,), and poses, shape (g, 4, 4), of the whole recording;
                 None: only the poses of the frames are known.

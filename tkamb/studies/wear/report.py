@@ -62,13 +62,8 @@ class WearReport:
     """A finished wear simulation.
 
     Args:
-        setup: bodies, motion and contact.
-        case: bodies, motion and laws of the simulation.
-        material: wear material with its sources.
         state: insert at the end.
         last: wear of one cycle on the insert at the end.
-        cycles: requested number of cycles.
-        updates: requested number of updates of the geometry.
         first: checks of the first cycle.
         bands: bands of the rows of the table; None: not requested.
     """
@@ -363,7 +358,6 @@ def draw_wear(
     Args:
         surface: insert in the insert frame.
         maps: name -> values at the vertices.
-        path: PNG file to write.
         side: "right" or "left" knee.
     """
     from matplotlib.figure import Figure

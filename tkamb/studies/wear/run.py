@@ -74,10 +74,6 @@ def keep_state(folder: Path, state: WearState, identity: str) -> None:
 def kept_state(folder: Path, identity: str) -> WearState | None:
     """Return the state that is stored in a folder; None if there is none.
 
-    Args:
-        folder: folder of the simulation.
-        identity: hash of the simulation, from `wear_identity`.
-
     Raises:
         InputError: the state belongs to another simulation, or is damaged.
     """
@@ -101,9 +97,6 @@ class WearRun:
     """A wear simulation with checked inputs.
 
     Args:
-        setup: bodies, motion and contact.
-        material: wear material.
-        updates: number of updates of the geometry.
         sampling: samples for bands; None: no bands.
     """
 
@@ -233,7 +226,6 @@ def prepare_wear(
     """Return a wear simulation with checked inputs.
 
     Args:
-        path: scene file, or folder that `tkamb run` wrote.
         updates: number of updates of the insert's geometry.
         law: name of a wear law (`tkamb.studies.wear.laws`); None: that of [wear] in the scene, or
             the default law of the material.
@@ -243,7 +235,6 @@ def prepare_wear(
         samples: number of samples for bands, at least 20; 0: no bands; None: 32 if the scene has
             [uncertainty].
         period: duration of a simulator's cycle, s.
-        setup: further arguments of `tkamb.studies.wear.setup.wear_setup`.
 
     Raises:
         InputError: an argument or the scene is invalid.
@@ -272,8 +263,6 @@ def wear_of_results(
     Material, law and closing of the cycle are those of [wear] in the scene.
 
     Args:
-        scene: scene of the results, with their contact model.
-        results: results with pressure maps.
         updates: number of updates of the insert's geometry.
         frames: largest number of frames of a cycle.
 

@@ -40,12 +40,9 @@ class WearSetup:
     """Bodies, motion and contact of a wear simulation.
 
     Args:
-        engine: contact model, femoral component and material.
         articular: articular surface of the insert.
-        motion: motion of one cycle.
         side: side of the knee. The bodies of a left knee are mirrored.
         resolution_mm: spacing of the model's map points, mm.
-        source: file or folder of the motion.
         scene_sha256: SHA-256 of the scene, without and with the requested contact model. The
             summary of a run of the scene contains one of them.
         files_sha256: SHA-256 of the files that the scene names.
@@ -86,7 +83,6 @@ def wear_setup(
     """Return bodies, motion and contact of a wear simulation.
 
     Args:
-        path: scene file, or folder that `tkamb run` wrote.
         simulator: file of a profile (`tkamb.studies.wear.simulator`) that replaces the motion of
             the scene.
         springs: file of the springs of the simulator for force control.
@@ -161,8 +157,6 @@ def setup_of_results(scene: Scene, path: Path, results: Results, frames: int) ->
     """Return bodies, motion and contact of a wear simulation from results in memory.
 
     Args:
-        scene: scene of the results, with their contact model.
-        results: results with pressure maps.
         frames: largest number of frames of a cycle.
 
     Raises:
@@ -264,9 +258,6 @@ def _cycle_of(
     """Return the cycle of some computed frames.
 
     Args:
-        track: computed frames.
-        chosen: numbers of the frames of the cycle.
-        scene: scene with the closing of the cycle.
         recorded: times of the recording, s, shape (g,).
         whole: times and poses (g, 4, 4) of the recording; None: the poses are unknown.
     """

@@ -67,8 +67,6 @@ class WearCase:
     Args:
         engine: contact of the femoral component with an insert.
         articular: articular surface of the unworn insert.
-        motion: motion of one cycle.
-        law: wear law.
         density: density of the insert, kg/m³.
         creep: creep law; None: creep is not modelled.
     """
@@ -89,8 +87,6 @@ class WearState:
         wear: worn depth along the normal, m, shape (n,).
         creep: creep depth along y, m, shape (n,).
         fall: downward displacement of the vertices by wear and creep, m, shape (n,).
-        cycles: number of finished cycles.
-        step: length of the next block, cycles.
         volume: worn volume, m³.
         creep_volume: volume displaced by creep, m³.
         map_error: largest relative correction of the force of a map.
@@ -123,7 +119,6 @@ class CycleWear:
 
     Args:
         rate: worn depth per cycle along the normal, m, shape (n,).
-        history: pressure and sliding in the cycle.
         normals: unit normals, shape (n, 3).
         area: tributary areas, m², shape (n,).
         map_error: largest relative correction of the force of a map.

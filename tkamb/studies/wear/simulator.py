@@ -225,7 +225,6 @@ class EquilibriumPoses:
 
     Args:
         state: prepared contact of the model with the insert.
-        drive: loads of the machine.
     """
 
     def __init__(self, model: ContactModel, state: Any, drive: ForceDrive) -> None:
@@ -237,9 +236,7 @@ class EquilibriumPoses:
         """Return the equilibrium pose (4, 4) of row k and "", or a pose and the reason of failure.
 
         Args:
-            k: number of the row.
             load: axial load, N.
-            start: warm start of the contact, or an earlier contact.
         """
         coordinates = self._drive.coordinates[k].copy()
         if self._last is not None:

@@ -124,7 +124,6 @@ class ViscoelasticLattice:
     Limits: small strain, no yield, no friction, and constant Poisson's ratio.
 
     Args:
-        model: linear lattice, with its resolution.
         pair: both bodies. Young's modulus of the material is the instantaneous one.
         series: relaxation of all springs.
 

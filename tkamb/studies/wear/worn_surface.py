@@ -134,7 +134,6 @@ def refined(surface: Surface, longest: float, chosen: Chosen) -> Surface:
     not change, and the original vertices come first.
 
     Args:
-        surface: mesh with shared vertices.
         longest: largest length of an edge, m.
         chosen: function of a surface that returns whether to refine each face, shape (k,).
     """
