@@ -3,12 +3,12 @@
 import numpy as np
 
 from tkamb.geometry.frames import pose
-from tkamb.io.opensim.functions import Linear
 from tkamb.io.opensim.model import (
     Body,
     Coordinate,
     Joint,
     JointAxis,
+    Linear,
     OpenSimModel,
     OpenSimMuscle,
     Path,

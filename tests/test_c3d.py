@@ -10,10 +10,10 @@ import pytest
 from recordings import AMTI_CORNERS, standing_markers, write_c3d
 from tkamb.errors import InputError
 from tkamb.io.recordings.c3d import read_c3d
+from tkamb.io.recordings.filtering import OddSample
 from tkamb.io.recordings.ground_reaction import load_ground_reaction
 from tkamb.io.recordings.markers import matched_labels
 from tkamb.io.recordings.recording_tables import GroundReactionTable
-from tkamb.io.recordings.samples import OddSample
 from tkamb.io.recordings.tables import read_table
 from tkamb.run.plausibility.movement import sample_questions
 

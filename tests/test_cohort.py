@@ -24,10 +24,9 @@ from tkamb.run.simulation import simulate
 from tkamb.run.workers import PoolOptions
 from tkamb.show.cohort_report import _split_into_plots, cohort_html, draw_groups
 from tkamb.show.study_figures import design_bars, draw_designs, run_error
-from tkamb.studies.cohort.outcome import Outcome, chosen_map
+from tkamb.studies.cohort.outcome import Group, Outcome, chosen_map, groups_of, spread
 from tkamb.studies.cohort.plan import CohortTable, load_cohort
 from tkamb.studies.cohort.run import frame_table, run_cohort, write_cohort
-from tkamb.studies.cohort.statistics import Group, groups_of, spread
 
 KNEE = Path(__file__).parents[1] / "models" / "deep_knee_bend"
 WRITTEN = {"cohort.parquet", "runs.csv", "groups.csv", "cohort.json", "cohort.html"}

@@ -13,8 +13,7 @@ from tkamb.cli import main
 from tkamb.contact.materials import material
 from tkamb.errors import InputError
 from tkamb.io.starter import lay_out
-from tkamb.run.decks import contact_quads
-from tkamb.run.frame_press import frame_press
+from tkamb.run.decks import contact_quads, frame_press
 from tkamb.run.results_folder import read_results
 from tkamb.run.simulation import simulate
 from tkamb.studies.calculix import peer_result, run_calculix

@@ -15,8 +15,8 @@ from scenes import write_scene
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.io.claim import settle
+from tkamb.io.mesh_files import write_hexahedra
 from tkamb.io.scene import Scene
-from tkamb.io.vtk import write_hexahedra
 from tkamb.run.reproduction import verify_results
 from tkamb.run.results_folder import read_results
 from tkamb.studies.kept_rows import KeptRows

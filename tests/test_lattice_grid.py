@@ -43,8 +43,8 @@ from tkamb.geometry.frames import pose
 from tkamb.geometry.height_field import Intervals
 from tkamb.geometry.repair import repair
 from tkamb.geometry.surface import Surface
+from tkamb.io.mesh_files import write_lattice
 from tkamb.io.recordings.meshes import axes_rotation
-from tkamb.io.vtk import write_lattice
 
 SIZES = np.array([3.0, 2.0, 1.5, 1.0])
 INSERTS = [pytest.param("dm", marks=pytest.mark.slow), "jw", "shipped"]

@@ -7,9 +7,8 @@ from jw_gait import gait, needs_jw
 from plane_leg import COORDINATES, MASSES, SHANK, muscle, plane_leg
 from tkamb.errors import InputError
 from tkamb.io.importing.anatomy import find_leg
-from tkamb.io.opensim.functions import Linear
 from tkamb.io.opensim.kinematics import Kinematics
-from tkamb.io.opensim.model import CoordinateCoupler
+from tkamb.io.opensim.model import CoordinateCoupler, Linear
 from tkamb.io.opensim.motion import CoordinateMotion, coordinate_motion, read_coordinates
 from tkamb.io.recordings.tables import Table
 from tkamb.run.muscles import Sharing, solve_trial

@@ -6,7 +6,7 @@ import pytest
 from opensim_models import OWN, PUBLISHED, kinematics
 from opensim_references import WEIGHTS, references
 from tkamb.errors import InputError
-from tkamb.io.opensim.functions import Linear, Polynomial, Scaled, piecewise_linear, simm_spline
+from tkamb.io.opensim.model import Linear, Polynomial, Scaled, piecewise_linear, simm_spline
 
 X = np.array([-1.0, -0.4, 0.1, 0.7, 1.5])
 

@@ -8,8 +8,7 @@ import pytest
 
 from pendulum_leg import changed, recorded_leg
 from tkamb.cli import _parser, main
-from tkamb.commands.help_examples import EXAMPLES
-from tkamb.commands.options import RULES, Rule, check_options, leaf_parsers
+from tkamb.commands.options import EXAMPLES, RULES, Rule, check_options, leaf_parsers
 from tkamb.io.recordings.tables import read_table
 from tkamb.show.storage import write_storage
 

@@ -16,8 +16,7 @@ from tkamb.contact.registry import contact_model
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import knee_pose
 from tkamb.geometry.surface import Surface
-from tkamb.run.decks import Deck
-from tkamb.run.frame_press import press_problem
+from tkamb.run.decks import Deck, press_problem
 from tkamb.studies import calculix as peer
 from tkamb.studies.calculix import PeerRun, measure_by_calculix, press_by_calculix, run_calculix
 from tkamb.studies.cases import balls, block, dishes, study_case

@@ -8,8 +8,8 @@ from test_c3d import COUNT, RATIO, Z0, A, B, plate_signals, pushes
 from tkamb.errors import InputError
 from tkamb.io.recordings.c3d import read_c3d
 from tkamb.io.recordings.ground_reaction import load_ground_reaction
+from tkamb.io.recordings.laboratory import GivenUnits, metres, newton_metres, newtons
 from tkamb.io.recordings.recording_tables import GroundReactionTable
-from tkamb.io.recordings.unit_words import GivenUnits, metres, newton_metres, newtons
 from tkamb.run.plausibility.movement import drift_questions
 
 ORIGIN = np.array([0.003, -0.002, -0.03])

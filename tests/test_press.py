@@ -20,7 +20,7 @@ from tkamb.contact.registry import contact_class, contact_names
 from tkamb.errors import InputError
 from tkamb.geometry.surface import Surface
 from tkamb.io import starter
-from tkamb.io.recordings.vtp import read_vtp
+from tkamb.io.recordings.polygon_files import read_vtp
 from tkamb.run import press
 from tkamb.run.press import read_pose
 from tkamb.units import LENGTH, MILLIMETRE

@@ -9,9 +9,9 @@ import pytest
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import pose
-from tkamb.io.importing.marked_trials import moved_markers
 from tkamb.io.importing.markers import ModelSegment
 from tkamb.io.importing.registration import REGISTRATION, _MarkedLeg, register
+from tkamb.io.importing.trial import moved_markers
 from tkamb.units import DEGREE, MILLIMETRE
 
 LEG = SimpleNamespace(

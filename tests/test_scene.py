@@ -16,7 +16,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import KNEE_COORDINATES, MIRROR, transform
 from tkamb.io.recordings import recording_tables
 from tkamb.io.recordings.meshes import load_surface
-from tkamb.io.recordings.scene_table import SceneTable
+from tkamb.io.recordings.recording_tables import SceneTable
 from tkamb.io.recordings.tibia import load_tibia
 from tkamb.io.scene import scene as scene_module
 from tkamb.io.scene import tables

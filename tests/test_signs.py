@@ -11,7 +11,7 @@ import pytest
 from mistakes import DATA, DM
 from scenes import MODEL, as_toml
 from tkamb.errors import InputError
-from tkamb.io.recordings.samples import OddSample
+from tkamb.io.recordings.filtering import OddSample
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.knee.ligaments import check_collateral_sides

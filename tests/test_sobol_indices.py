@@ -9,9 +9,14 @@ from test_uncertainty import SCENE, SLOPES, bodies_alone
 from tkamb.cli import main
 from tkamb.commands.uncertainty import headline
 from tkamb.studies.uncertainty.bands import influences
-from tkamb.studies.uncertainty.inputs import VariedInput
+from tkamb.studies.uncertainty.inputs import (
+    VariedInput,
+    crossed_points,
+    noise,
+    noise_of_point,
+    normal_samples,
+)
 from tkamb.studies.uncertainty.run import estimate_uncertainty
-from tkamb.studies.uncertainty.sampling import crossed_points, noise, noise_of_point, normal_samples
 from tkamb.studies.uncertainty.sensitivity import Screened, screen, screen_lines, sobol_indices
 
 pytestmark = pytest.mark.usefixtures("plain_report")

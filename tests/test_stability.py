@@ -20,12 +20,14 @@ from tkamb.show.study_figures import picture
 from tkamb.studies import stability
 from tkamb.studies.extremes import Extreme, extremes
 from tkamb.studies.kept_rows import KeptRows, row_key
-from tkamb.studies.scene_extremes import SceneExtreme, judge_scene, scene_extremes
 from tkamb.studies.stability import (
+    SceneExtreme,
     _Judges,
     judge_safely,
+    judge_scene,
     kept_verdicts,
     run_stability,
+    scene_extremes,
     stability_cases,
     stored_verdicts,
     summary,

@@ -9,8 +9,7 @@ import pytest
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from PIL import Image
 
-from tkamb.show.style import new_figure, settings
-from tkamb.show.svg import written
+from tkamb.show.style import new_figure, settings, written
 
 
 def labelled_figure(size):

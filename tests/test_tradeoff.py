@@ -17,7 +17,6 @@ from tkamb.geometry.memory import peak_rss
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.studies import tradeoff
-from tkamb.studies.body_trade import CHANGES, body_table, run_body_trade
 from tkamb.studies.cases import case_names, copied_scene, study_case, thin_out
 from tkamb.studies.kept_rows import KeptRows
 from tkamb.studies.measures import (
@@ -38,7 +37,7 @@ from tkamb.studies.references import (
     sphere_on_layer,
     write_references,
 )
-from tkamb.studies.tradeoff import EQUAL_RATIO, on_front
+from tkamb.studies.tradeoff import CHANGES, EQUAL_RATIO, body_table, on_front, run_body_trade
 from tradeoff_blocks import moved
 
 ROOT = Path(__file__).parents[1]

@@ -22,10 +22,9 @@ from tkamb.run.known_errors import (
     as_json as error_json,
 )
 from tkamb.show.tradeoff_report import comparison, picture, recommendations, table
-from tkamb.studies.body_trade import read_body_rows
 from tkamb.studies.measures import Job, Measure
 from tkamb.studies.references import read_references
-from tkamb.studies.tradeoff import KEYS, TIMES, Row, as_json, read_rows, with_fronts
+from tkamb.studies.tradeoff import KEYS, TIMES, Row, as_json, read_body_rows, read_rows, with_fronts
 from tradeoff_blocks import (
     MARKERS,
     WIDENING,

@@ -19,19 +19,22 @@ from tkamb.knee.load import PointForces
 from tkamb.run.muscles.shared_muscles import SharedMuscles
 from tkamb.run.read_scene import recording_of
 from tkamb.studies.uncertainty.bands import influences
-from tkamb.studies.uncertainty.inputs import AXES, Draw, VariedInput, varied_inputs
+from tkamb.studies.uncertainty.inputs import (
+    AXES,
+    Draw,
+    Point,
+    VariedInput,
+    correlation_root,
+    normal_samples,
+    one_at_a_time,
+    varied_inputs,
+)
 from tkamb.studies.uncertainty.run import estimate_uncertainty
 from tkamb.studies.uncertainty.sample import (
     Sampler,
     displaced_by_markers,
     varied_case,
     varied_muscles,
-)
-from tkamb.studies.uncertainty.sampling import (
-    Point,
-    correlation_root,
-    normal_samples,
-    one_at_a_time,
 )
 
 NAMES = ["a", "b", "c"]

@@ -18,10 +18,9 @@ from tkamb.run.simulation import simulate
 from tkamb.show.axis import horizontal_axis
 from tkamb.show.headline import cards
 from tkamb.studies.uncertainty.bands import band_columns, peak_band
-from tkamb.studies.uncertainty.inputs import Draw, VariedInput, varied_inputs
+from tkamb.studies.uncertainty.inputs import Draw, Point, VariedInput, varied_inputs
 from tkamb.studies.uncertainty.run import estimate_uncertainty
 from tkamb.studies.uncertainty.sample import Sampler, varied_case
-from tkamb.studies.uncertainty.sampling import Point
 
 NOMINAL = np.array([1.0, 3.39, 2.0])
 

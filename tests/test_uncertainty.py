@@ -24,10 +24,9 @@ from tkamb.studies.uncertainty.bands import (
     measured_inside,
     percentiles,
 )
-from tkamb.studies.uncertainty.inputs import Draw
+from tkamb.studies.uncertainty.inputs import Draw, Point, noise, normal_samples
 from tkamb.studies.uncertainty.run import estimate_uncertainty, write_uncertainty
 from tkamb.studies.uncertainty.sample import Sampler
-from tkamb.studies.uncertainty.sampling import Point, noise, normal_samples
 
 pytestmark = pytest.mark.usefixtures("plain_report")
 

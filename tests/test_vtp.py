@@ -10,8 +10,8 @@ import pytest
 
 from shapes import two_dishes
 from tkamb.errors import InputError
+from tkamb.io.mesh_files import write_triangles
 from tkamb.io.recordings.meshes import load_surface, read_triangles
-from tkamb.io.vtk import write_triangles
 
 BODY = two_dishes(0.05)
 ARRAYS = {

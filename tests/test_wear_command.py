@@ -17,8 +17,14 @@ from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry.frames import knee_coordinates
 from tkamb.studies.wear import run as wear_run
-from tkamb.studies.wear.laws import Archard, ContactArea, law_names, wear_law
-from tkamb.studies.wear.materials import material_names, wear_material
+from tkamb.studies.wear.laws import (
+    Archard,
+    ContactArea,
+    law_names,
+    material_names,
+    wear_law,
+    wear_material,
+)
 from tkamb.studies.wear.report import STATE_NAME
 from tkamb.studies.wear.setup import wear_setup
 from tkamb.studies.wear.simulation import first_cycle

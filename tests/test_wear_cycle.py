@@ -11,13 +11,13 @@ from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry.frames import pose
 from tkamb.geometry.surface import Surface
+from tkamb.studies.wear.engine import SlidingHistory
 from tkamb.studies.wear.laws import Archard
 from tkamb.studies.wear.motion import CLOSINGS, CycleMotion, chosen_frames, distance
 from tkamb.studies.wear.run import prepare_wear
 from tkamb.studies.wear.setup import wear_setup
 from tkamb.studies.wear.simulation import first_cycle, simulate_wear
 from tkamb.studies.wear.simulator import read_profile
-from tkamb.studies.wear.sliding import SlidingHistory
 from wear_bodies import MM, balls_scene, plate_case
 
 K, LOAD = 1e-6, 1000.0

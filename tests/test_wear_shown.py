@@ -13,8 +13,8 @@ from headless import Page, chromium
 from synthetic_run import make_run
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR
-from tkamb.io.recordings.vtp import read_vtp, read_vtp_values
-from tkamb.io.vtk import write_triangles
+from tkamb.io.mesh_files import write_triangles
+from tkamb.io.recordings.polygon_files import read_vtp, read_vtp_values
 from tkamb.run.results_folder import read_results
 from tkamb.show.report import report_html
 from tkamb.show.sections import OTHER_WEAR, wear_section

@@ -9,8 +9,13 @@ import shapes
 from contact_bodies import dished_insert
 from tkamb.errors import InputError
 from tkamb.geometry.surface import Surface
-from tkamb.studies.wear.laws import Archard, ContactArea, CrossShear, PressureCrossShear
-from tkamb.studies.wear.materials import LogarithmicCreep
+from tkamb.studies.wear.laws import (
+    Archard,
+    ContactArea,
+    CrossShear,
+    LogarithmicCreep,
+    PressureCrossShear,
+)
 from tkamb.studies.wear.simulation import simulate_wear
 from wear_bodies import DENSITY, MM, ball_case, plate_case, stroke, swing, swinging_case
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tkamb.geometry.frames import pose, transform
-from tkamb.studies.wear.sliding import SlidingHistory, cross_shear_ratio, step_sliding
+from tkamb.studies.wear.engine import SlidingHistory, cross_shear_ratio, step_sliding
 
 UP = np.array([[0.0, 1.0, 0.0]])
 POINT = np.array([[0.01, 0.008, -0.02]])

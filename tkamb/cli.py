@@ -12,10 +12,15 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from tkamb import __version__
 from tkamb.commands.check import add_check
-from tkamb.commands.help_examples import add_examples
 from tkamb.commands.import_model import add_data, add_import
 from tkamb.commands.mesh import add_contact, add_mesh, add_no_cache, add_press, without_cache
-from tkamb.commands.options import add_preset, add_scene_options, check_options, overrides_of
+from tkamb.commands.options import (
+    add_examples,
+    add_preset,
+    add_scene_options,
+    check_options,
+    overrides_of,
+)
 from tkamb.commands.results import (
     add_compare,
     add_export,

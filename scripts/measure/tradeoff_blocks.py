@@ -19,9 +19,8 @@ from tkamb.show.tradeoff_report import (
     setting_of,
     warm_by_bodies,
 )
-from tkamb.studies.body_trade import HEADS as BODY_HEADS
-from tkamb.studies.body_trade import BodyRow
-from tkamb.studies.tradeoff import EQUAL_RATIO, KEYS, Row, beats, on_front
+from tkamb.studies.tradeoff import EQUAL_RATIO, KEYS, BodyRow, Row, beats, on_front
+from tkamb.studies.tradeoff import HEADS as BODY_HEADS
 
 MARKERS = "<!-- {}:begin -->", "<!-- {}:end -->"
 HEADS = ("approach", "condyle force", "mean p", "peak p", "area", "map L2")

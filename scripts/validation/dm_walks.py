@@ -3,8 +3,7 @@
 from pathlib import Path
 
 from tkamb.io.importing.patient import import_patient, write_patient
-from tkamb.io.importing.request import ImportRequest
-from tkamb.io.importing.scene_text import Meshes
+from tkamb.io.importing.scene_text import ImportRequest, Meshes
 
 MASS_KG = 69.98
 TRIALS = {

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from tkamb.errors import InputError
-from tkamb.io.activities import Activity
 from tkamb.io.datasets import NAMES, read_dataset
+from tkamb.io.scene.tables import Activity
 from tkamb.units import ANGLE, LENGTH
 
 if TYPE_CHECKING:
     from tkamb.io.importing.patient import ImportedPatient
-    from tkamb.io.importing.request import ImportRequest
+    from tkamb.io.importing.scene_text import ImportRequest
 
 
 def add_data(commands: Any) -> None:
@@ -337,7 +337,7 @@ def _import(options: argparse.Namespace) -> int:
 
 def _write_registration(patient: "ImportedPatient", path: Path) -> None:
     from tkamb.files import replaced_file
-    from tkamb.show.registration_picture import draw_registration
+    from tkamb.show.leg_picture import draw_registration
 
     assert patient.registration is not None
     figure = draw_registration(patient.scene.links, patient.model_segments, patient.registration)
@@ -351,8 +351,8 @@ def import_request(options: argparse.Namespace) -> "ImportRequest":
     Raises:
         InputError: options exclude each other, or a number is out of range.
     """
-    from tkamb.io.importing.request import ImportRequest
-    from tkamb.io.recordings.unit_words import GivenUnits
+    from tkamb.io.importing.scene_text import ImportRequest
+    from tkamb.io.recordings.laboratory import GivenUnits
 
     if not options.mass_kg > 0:
         raise InputError(f"a mass of {options.mass_kg:g} kg is not positive", "--mass-kg")

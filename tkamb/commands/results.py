@@ -141,7 +141,7 @@ def _export(options: argparse.Namespace) -> int:
 def _export_figures(options: argparse.Namespace) -> int:
     from tkamb.io.claim import claimed_directory
     from tkamb.run.results_folder import read_results
-    from tkamb.show.figure_files import FORMATS, write_figures
+    from tkamb.show.storage import FORMATS, write_figures
 
     results = read_results(options.folder)
     with claimed_directory(options.out, options.force) as folder:
@@ -154,7 +154,7 @@ def _export_deck(options: argparse.Namespace) -> int:
     from tkamb.contact.registry import COARSEST
     from tkamb.files import write_text
     from tkamb.io.claim import check_output_file
-    from tkamb.run.frame_press import SUFFIX, frame_press
+    from tkamb.run.decks import SUFFIX, frame_press
 
     if options.out.suffix.lower() != SUFFIX[options.deck]:
         suffix = SUFFIX[options.deck]
@@ -181,7 +181,7 @@ def _export_storage(options: argparse.Namespace) -> int:
 
 def _export_maps(options: argparse.Namespace) -> int:
     from tkamb.io.claim import claimed_directory
-    from tkamb.io.vtk import write_map_series
+    from tkamb.io.mesh_files import write_map_series
     from tkamb.run.results_folder import read_results
 
     results = read_results(options.folder)

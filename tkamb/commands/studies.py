@@ -143,9 +143,16 @@ def _study_tradeoff(options: argparse.Namespace, directory: Path) -> int:
         table,
     )
     from tkamb.studies import tradeoff as study
-    from tkamb.studies.body_trade import CHANGES, BodyRow, body_json, body_table, run_body_trade
     from tkamb.studies.kept_rows import KeptRows
-    from tkamb.studies.tradeoff import as_json, with_fronts
+    from tkamb.studies.tradeoff import (
+        CHANGES,
+        BodyRow,
+        as_json,
+        body_json,
+        body_table,
+        run_body_trade,
+        with_fronts,
+    )
 
     jobs = study.jobs(options.quick, options.scene, options.full)
     cases = study.cases_of(jobs)

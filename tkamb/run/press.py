@@ -124,7 +124,7 @@ class PressReport:
         Raises:
             InputError: the format is another one, or the file cannot be written.
         """
-        from tkamb.io.vtk import write_triangles
+        from tkamb.io.mesh_files import write_triangles
 
         result, triangles = self.result, self.triangles
         points, force = result.points, result.nodal_force

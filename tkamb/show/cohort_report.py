@@ -20,9 +20,8 @@ from tkamb.show.pressure_maps import TopView, draw_pressure
 from tkamb.show.study_figures import BANDS, design_bars, draw_designs, run_error
 from tkamb.show.style import CYCLE as COLOURS
 from tkamb.show.style import PRESSURE_MAP, legend_above, new_figure, settings, svg_text
-from tkamb.studies.cohort.outcome import Outcome
+from tkamb.studies.cohort.outcome import CYCLE, Group, Outcome, spread
 from tkamb.studies.cohort.plan import Cohort
-from tkamb.studies.cohort.statistics import CYCLE, Group, spread
 from tkamb.units import MEGAPASCAL
 
 PACKAGE = "tkamb.studies.cohort"

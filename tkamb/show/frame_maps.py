@@ -17,8 +17,7 @@ from tkamb.geometry.frames import SIDES, Array
 from tkamb.run.metrics import map_rows
 from tkamb.show.levels import pressure_levels, touched_part
 from tkamb.show.pressure_maps import TopView, place_maps, pressure_bar
-from tkamb.show.style import PRESSURE_MAP, new_figure, settings
-from tkamb.show.svg import png_address
+from tkamb.show.style import PRESSURE_MAP, new_figure, png_address, settings
 from tkamb.units import MEGAPASCAL
 
 if TYPE_CHECKING:

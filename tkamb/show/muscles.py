@@ -21,21 +21,19 @@ from tkamb.show.axis import HorizontalAxis
 from tkamb.show.panels import Line, Panel
 from tkamb.show.style import (
     BLACK,
+    EDGE_POINTS,
     GREY,
     LIGAMENT,
     LIST,
     QUADRICEPS,
-    new_figure,
-    settings,
-)
-from tkamb.show.svg import (
-    EDGE_POINTS,
     TICK_LABEL_POINTS,
     TICK_POINTS,
     label_width,
     leave_unmeasured,
+    new_figure,
     overhang,
     set_place,
+    settings,
 )
 
 if TYPE_CHECKING:

@@ -16,18 +16,16 @@ from tkamb.show.axis import HorizontalAxis, horizontal_axis
 from tkamb.show.panels import Line, Panel, centre_panel, panels
 from tkamb.show.style import (
     BLACK,
+    EDGE_POINTS,
     GREY,
     ORANGE,
-    legend_above,
-    new_figure,
-    settings,
-)
-from tkamb.show.svg import (
-    EDGE_POINTS,
     TICK_POINTS,
     label_width,
     leave_unmeasured,
+    legend_above,
+    new_figure,
     set_place,
+    settings,
     text_width,
 )
 

@@ -1,4 +1,4 @@
-"""Pressure on the insert seen from above, and the paths of the centres of pressure.
+"""Pressure on the insert seen from above, paths of the centres of pressure, and the button's map.
 
 The view is from above: anterior is up, and the subject's right is on the right of the page. A left
 knee is mirrored at input and mirrored back in the picture.
@@ -368,3 +368,45 @@ def _spread(heights: Array, step: float) -> Array:
     count = np.arange(len(heights))
     raised = np.maximum.accumulate(heights - step * count) + step * count
     return raised - 0.5 * float(np.mean(raised - heights))
+
+
+COUNT = 8
+"""Number of maps."""
+
+
+def draw_button_maps(results: "Results", axis: HorizontalAxis) -> Figure | None:
+    """Return a figure of the button's pressure maps in some frames; None without maps.
+
+    The frame of the largest pressure is one of them.
+    """
+    maps, rows = results.button_maps, map_rows(results, results.button_maps)
+    if maps is None or not rows or not len(maps.triangles):
+        return None
+    peak = results["button_peak_pressure_MPa"]
+    known = np.array(sorted(rows), int)
+    chosen = {int(known[np.argmin(np.abs(known - stop))]) for stop in axis.stops(COUNT)}
+    largest = int(known[np.nanargmax(peak[known])])
+    if largest not in chosen:  # it replaces the nearest frame
+        chosen.discard(min(chosen, key=lambda frame: abs(frame - largest)))
+    frames = sorted({*chosen, largest})
+    view = TopView(maps, str(results.summary.get("side", "right")), lateral_axis_name(results))
+    scale = Normalize(0.0, float(peak[largest]))
+    across = min(4, len(frames))
+    down = -(-len(frames) // across)
+    with settings():
+        figure = new_figure(11.0, down * (10.0 / 4 * np.ptp(view.up) / np.ptp(view.across) + 0.75))
+        grid, beside = place_maps(figure, down, across, 26.0)
+        for axes, frame in zip(grid, frames, strict=False):
+            view.draw_insert(axes)
+            data = maps.frame_data(rows[frame])
+            draw_pressure(axes, view, data["pressure_Pa"] / MEGAPASCAL, scale, data["gap_m"])
+            centre = (results[f"button_cop_{place}_mm"][frame] for place in ("si", "ml"))
+            draw_centre(axes, *view.page_coordinates(*centre))
+            view.draw_labels(axes, upward="superior")
+            words = "; peak pressure" if frame == largest else ""
+            name = f"{axis.label.split(' (')[0]} {axis.at(frame)}"
+            axes.set_title(f"{name}, {results['button_force_N'][frame]:.0f} N{words}", fontsize=8.5)
+        for axes in grid[len(frames) :]:
+            axes.set_axis_off()
+        pressure_bar(figure, scale, cax=beside)
+    return figure

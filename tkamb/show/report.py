@@ -23,14 +23,19 @@ from tkamb.show.axis import (
     results_at,
     shown_frames,
 )
-from tkamb.show.button_maps import draw_button_maps
 from tkamb.show.frame_maps import draw_insert, frame_maps, largest_pressure
 from tkamb.show.headline import cards, run_title
 from tkamb.show.methods import methods
 from tkamb.show.pages import asset, policy_sources, render
 from tkamb.show.panels import Panel, centre_panel, panels
 from tkamb.show.plots import WIDTH, Sheet
-from tkamb.show.pressure_maps import draw_maps, draw_paths, mapped_frames, top_view
+from tkamb.show.pressure_maps import (
+    draw_button_maps,
+    draw_maps,
+    draw_paths,
+    mapped_frames,
+    top_view,
+)
 from tkamb.show.sections import (
     conclusions,
     flag_rows,

@@ -15,12 +15,7 @@ from tkamb.geometry.frames import Array
 from tkamb.run import metrics, texts
 from tkamb.run.claims import compared_forces, method_error, peaks_of, split_of
 from tkamb.run.known_errors import is_large, known_error_words
-from tkamb.run.metrics import (
-    body_weight,
-    medial_share,
-    residual_share,
-    tension_ratio,
-)
+from tkamb.run.metrics import body_weight, medial_share, residual_share, tension_ratio
 from tkamb.show.axis import HorizontalAxis
 from tkamb.show.headline import OTHER_ERRORS, PRESSURE_AND_AREA
 

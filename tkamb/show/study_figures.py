@@ -20,9 +20,8 @@ from tkamb.show.style import (
     new_figure,
     settings,
 )
-from tkamb.studies.cohort.outcome import Outcome
+from tkamb.studies.cohort.outcome import Group, Outcome
 from tkamb.studies.cohort.plan import Cohort, CohortRun
-from tkamb.studies.cohort.statistics import Group
 from tkamb.studies.verdict import KINDS, MAX_ERROR, Verdict
 
 WEAR = "volume_mm3_per_Mc"

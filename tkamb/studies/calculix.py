@@ -32,8 +32,7 @@ from tkamb.contact.result import ContactResult
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.frames import Array
 from tkamb.geometry.memory import peak_rss
-from tkamb.run.decks import ELEMENT, Deck
-from tkamb.run.frame_press import PressProblem, press_problem
+from tkamb.run.decks import ELEMENT, Deck, PressProblem, press_problem
 from tkamb.studies.cases import StudyCase
 from tkamb.studies.measures import ONE_THREAD, Measure, quantities, raster_map
 from tkamb.units import MEGAPASCAL, MILLIMETRE

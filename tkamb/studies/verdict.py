@@ -39,14 +39,14 @@ from tkamb.contact.registry import contact_class, contact_model
 from tkamb.contact.result import ContactResult, ContactStatus, Guess
 from tkamb.errors import ComputationError, InputError, TkambError
 from tkamb.studies.cases import content_hash
-from tkamb.studies.closed_forms import (
+from tkamb.studies.extremes import Extreme
+from tkamb.studies.measures import Quantities, errors, quantities
+from tkamb.studies.references import (
     TOLERANCES,
     ClosedForm,
     press_closed_form,
     relative_errors,
 )
-from tkamb.studies.extremes import Extreme
-from tkamb.studies.measures import Quantities, errors, quantities
 from tkamb.units import MILLIMETRE
 
 # Largest relative difference of forces and pressures from the load. A few times the

@@ -13,19 +13,17 @@ from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.surface import Surface
 from tkamb.io.importing.anatomy import Leg, find_leg
 from tkamb.io.importing.links import Links, find_links, patient_urdf
-from tkamb.io.importing.marked_trials import with_registered_markers
 from tkamb.io.importing.markers import ModelSegment, recorded_labels, with_prefix
-from tkamb.io.importing.model_motion import MOTION_FILE
-from tkamb.io.importing.recorded_poses import read_poses
+from tkamb.io.importing.recorded_poses import MOTION_FILE, read_poses
 from tkamb.io.importing.registration import Registration
-from tkamb.io.importing.request import ImportRequest
-from tkamb.io.importing.scene_text import GROUND_FILE, SceneText
+from tkamb.io.importing.scene_text import GROUND_FILE, ImportRequest, SceneText
 from tkamb.io.importing.soft_tissue import soft_tissue, some_names
 from tkamb.io.importing.trial import (
     Trial,
     from_coordinates,
     from_markers,
     from_poses,
+    with_registered_markers,
     with_static_markers,
 )
 from tkamb.io.opensim.model import OpenSimModel

@@ -19,7 +19,7 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.files import parse_xml, read_bytes
 from tkamb.geometry.frames import Array
-from tkamb.io.opensim.functions import (
+from tkamb.io.opensim.model import (
     Function,
     Linear,
     Polynomial,

@@ -20,8 +20,7 @@ from numpy.typing import ArrayLike
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, inverse, pose
-from tkamb.io.opensim.functions import Linear
-from tkamb.io.opensim.model import GROUND, JointAxis, OpenSimModel
+from tkamb.io.opensim.model import GROUND, JointAxis, Linear, OpenSimModel
 
 
 @dataclass(frozen=True, eq=False)

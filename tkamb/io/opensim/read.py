@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.io.opensim.document import Document, Element, open_document
-from tkamb.io.opensim.functions import Scaled
 from tkamb.io.opensim.model import (
     GROUND,
     Body,
@@ -26,6 +25,7 @@ from tkamb.io.opensim.model import (
     Joint,
     Marker,
     OpenSimModel,
+    Scaled,
     Unread,
 )
 from tkamb.io.opensim.read_joints import Frames, outwards, read_joints

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array, pose, transform
 from tkamb.io.opensim.document import Document, Element
-from tkamb.io.opensim.functions import Linear
-from tkamb.io.opensim.model import GROUND, Coordinate, Joint, JointAxis
+from tkamb.io.opensim.model import GROUND, Coordinate, Joint, JointAxis, Linear
 
 X, Y, Z = np.eye(3)
 

@@ -8,11 +8,11 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.io.opensim.document import Document, Element
-from tkamb.io.opensim.functions import Function
 from tkamb.io.opensim.model import (
     AnyPathPoint,
     ConditionalPathPoint,
     Coordinate,
+    Function,
     MovingPathPoint,
     OpenSimLigament,
     OpenSimMuscle,

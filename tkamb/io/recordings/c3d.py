@@ -24,7 +24,7 @@ from tkamb.files import TABLE_BYTES, read_bytes
 from tkamb.geometry.frames import Array
 from tkamb.io.recordings.c3d_file import EXPORT, C3dFile, Parameters, parse_c3d
 from tkamb.io.recordings.force_plates import CHANNELS, ForcePlate, PlateRecord, force_plate
-from tkamb.io.recordings.unit_words import GivenUnits, metres
+from tkamb.io.recordings.laboratory import GivenUnits, metres
 
 # Largest measured value in any unit. A larger value is damaged and becomes a gap.
 MAX_VALUE = 1e12

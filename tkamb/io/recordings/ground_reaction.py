@@ -20,14 +20,19 @@ from numpy.typing import NDArray
 from tkamb.errors import InputError
 from tkamb.geometry.frames import MIRROR, Array
 from tkamb.io.recordings.c3d import read_c3d
-from tkamb.io.recordings.filtering import Cutoff, differentiate_coordinates
+from tkamb.io.recordings.filtering import (
+    Cutoff,
+    OddSample,
+    check_range,
+    check_spacing,
+    differentiate_coordinates,
+    odd_samples,
+)
 from tkamb.io.recordings.force_plates import DRIFT_N, around_load, unloaded_level
 from tkamb.io.recordings.gait_cycle import Gait, find_gait
-from tkamb.io.recordings.laboratory import check_roles, laboratory_rotation
+from tkamb.io.recordings.laboratory import GivenUnits, check_roles, laboratory_rotation
 from tkamb.io.recordings.recording_tables import GroundReactionTable, Side
-from tkamb.io.recordings.samples import OddSample, check_range, check_spacing, odd_samples
 from tkamb.io.recordings.tables import Table, read_table
-from tkamb.io.recordings.unit_words import GivenUnits
 from tkamb.units import MILLIMETRE
 
 DIRECTIONS = ("forward", "upward", "rightward")

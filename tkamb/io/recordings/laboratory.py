@@ -1,14 +1,94 @@
-"""Conversion of a file's columns to the laboratory (x forward, y up, z right) and SI."""
+"""Unit words of recordings, and columns in the laboratory (x forward, y up, z right) in SI.
 
+Case, blanks, dots, hyphens and asterisks are ignored. Only the listed words are units. For another
+word, a reader raises an error when it needs the quantity. No unit is guessed.
+"""
+
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tkamb.errors import InputError, names_near
 from tkamb.geometry.frames import Array, pose
-from tkamb.io.recordings.tables import Table
-from tkamb.units import ANGLE
+from tkamb.units import ANGLE, LENGTH, MILLIMETRE, STANDARD_GRAVITY
+
+if TYPE_CHECKING:
+    from tkamb.io.recordings.tables import Table
+
+POUND_FORCE = 0.45359237 * STANDARD_GRAVITY
+"""N; the international avoirdupois pound (1959) under standard gravity."""
+
+LENGTH_WORDS = {
+    **dict.fromkeys(("m", "mete", "meter", "meters", "metre", "metres"), 1.0),
+    **dict.fromkeys(("cm", "cent", "centimeter", "centimeters", "centimetre", "centimetres"), 1e-2),
+    **dict.fromkeys(
+        ("mm", "mill", "millimeter", "millimeters", "millimetre", "millimetres"), MILLIMETRE
+    ),
+    **dict.fromkeys(("in", "inch", "inches"), LENGTH["inch"]),
+    **dict.fromkeys(("ft", "foot", "feet"), 12 * LENGTH["inch"]),
+}
+"""Metres per unit. Some programs shorten a word to four letters."""
+FORCE_WORDS = {
+    **dict.fromkeys(("n", "nt", "newt", "newton", "newtons"), 1.0),
+    **dict.fromkeys(("dan", "decanewton", "decanewtons"), 10.0),
+    **dict.fromkeys(("kn", "kilonewton", "kilonewtons"), 1e3),
+    **dict.fromkeys(("kgf", "kp", "kilopond", "kiloponds"), STANDARD_GRAVITY),
+    **dict.fromkeys(("lb", "lbs", "lbf", "pound", "pounds"), POUND_FORCE),
+}
+"""Newtons per unit."""
+LENGTH_FIRST = ("in", "inch", "ft", "foot")
+"""Units of length that may precede the force, as in `in-lb`. `mN` is a millinewton."""
+
+_SEPARATORS = str.maketrans("", "", " .*-·⋅_\x00\t")
+
+
+@dataclass(frozen=True)
+class GivenUnits:
+    """Units that the user states. None: the unit that the recording states.
+
+    Args:
+        length: unit of markers and plates, like mm.
+        force: unit of force channels, like N.
+        moment: unit of moment channels, like Nmm.
+    """
+
+    length: str | None = None
+    force: str | None = None
+    moment: str | None = None
+
+
+def plain_unit(word: str) -> str:
+    """Return a unit word without case, blanks and separators."""
+    return word.translate(_SEPARATORS).lower()
+
+
+def metres(word: str) -> float | None:
+    """Return metres per unit of length; None for a word that is not a unit."""
+    return LENGTH_WORDS.get(plain_unit(word))
+
+
+def newtons(word: str) -> float | None:
+    """Return newtons per unit of force; None for a word that is not a unit."""
+    return FORCE_WORDS.get(plain_unit(word))
+
+
+def newton_metres(word: str) -> float | None:
+    """Return newton metres per unit of moment; None for a word that is not a unit.
+
+    A unit of moment is a unit of force, then one of length. Inches and feet may also come first.
+    """
+    plain = plain_unit(word)
+    for first in LENGTH_FIRST:
+        if plain.startswith(first) and plain[len(first) :] in FORCE_WORDS:
+            return LENGTH_WORDS[first] * FORCE_WORDS[plain[len(first) :]]
+    for cut in range(1, len(plain)):
+        force_unit, length_unit = FORCE_WORDS.get(plain[:cut]), LENGTH_WORDS.get(plain[cut:])
+        if force_unit is not None and length_unit is not None:
+            return force_unit * length_unit
+    return None
 
 
 def laboratory_rotation(axes: str, path: Path) -> Array:
@@ -39,7 +119,7 @@ def check_roles(columns: dict[str, str], roles: tuple[str, ...], path: Path, tab
             )
 
 
-def angle_scale(table: Table, angle_unit: str | None) -> float:
+def angle_scale(table: "Table", angle_unit: str | None) -> float:
     """Return radians per unit of angle.
 
     Raises:
@@ -57,7 +137,7 @@ def angle_scale(table: Table, angle_unit: str | None) -> float:
 
 
 def poses_of_columns(
-    table: Table,
+    table: "Table",
     columns: dict[str, str],
     sequence: str,
     angle_unit: str | None,

@@ -23,7 +23,7 @@ from tkamb.geometry.frames import (
     knee_coordinates,
     transform,
 )
-from tkamb.io.recordings.filtering import Cutoff, differentiate_poses
+from tkamb.io.recordings.filtering import Cutoff, check_spacing, differentiate_poses
 from tkamb.io.recordings.inverse_kinematics import (
     FLEXION,
     ChainFit,
@@ -35,7 +35,6 @@ from tkamb.io.recordings.inverse_kinematics import (
 from tkamb.io.recordings.laboratory import laboratory_rotation
 from tkamb.io.recordings.markers import MAX_MEDIAN_RESIDUAL, fit_seen, marker_trajectories
 from tkamb.io.recordings.recording_tables import MarkersTable, MotionTable, Side
-from tkamb.io.recordings.samples import check_spacing
 from tkamb.io.recordings.tables import Table, read_table
 from tkamb.io.recordings.tibia import BodyMotion
 from tkamb.units import DEGREE, MILLIMETRE

@@ -21,8 +21,8 @@ import numpy as np
 
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
+from tkamb.io.recordings.filtering import check_overlap
 from tkamb.io.recordings.recording_tables import EmgTable, MeasuredTable
-from tkamb.io.recordings.samples import check_overlap
 from tkamb.io.recordings.tables import Table, read_table
 
 FORCE = {"N": 1.0, "kN": 1e3, "lbf": 4.4482216152605}

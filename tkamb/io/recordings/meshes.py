@@ -16,8 +16,7 @@ from tkamb.geometry.polygons import triangulated
 from tkamb.geometry.repair import InnerWall, Repair, find_inner_wall, repair, touching_groups
 from tkamb.geometry.surface import Surface
 from tkamb.geometry.topology import Body, BoundaryLoop, connected_parts, separate_bodies
-from tkamb.io.recordings.polygon_files import read_binary_stl, read_obj, read_ply
-from tkamb.io.recordings.vtp import read_vtp
+from tkamb.io.recordings.polygon_files import read_binary_stl, read_obj, read_ply, read_vtp
 from tkamb.units import LENGTH, MILLIMETRE
 
 Indices = NDArray[np.int64]

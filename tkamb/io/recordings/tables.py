@@ -13,7 +13,7 @@ import numpy as np
 from tkamb.errors import InputError, names_near
 from tkamb.files import BYTE_ORDER_MARKS, TABLE_BYTES, read_bytes
 from tkamb.geometry.frames import Array
-from tkamb.io.recordings.unit_words import GivenUnits, metres
+from tkamb.io.recordings.laboratory import GivenUnits, metres
 from tkamb.units import LENGTH
 
 # s: largest rounding of the times of a `.trc`. Cameras write milliseconds.

@@ -10,7 +10,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tkamb.geometry.frames import MIRROR, Array, mirrored_pose, pose, transform
-from tkamb.io.recordings.filtering import Cutoff, differentiate_coordinates, differentiate_poses
+from tkamb.io.recordings.filtering import (
+    Cutoff,
+    OddSample,
+    check_range,
+    check_spacing,
+    check_steps,
+    differentiate_coordinates,
+    differentiate_poses,
+    odd_samples,
+)
 from tkamb.io.recordings.laboratory import (
     angle_scale,
     check_roles,
@@ -19,13 +28,6 @@ from tkamb.io.recordings.laboratory import (
 )
 from tkamb.io.recordings.markers import check_fit, complete_run, fit_rigid, shank_points
 from tkamb.io.recordings.recording_tables import Side, TibiaTable
-from tkamb.io.recordings.samples import (
-    OddSample,
-    check_range,
-    check_spacing,
-    check_steps,
-    odd_samples,
-)
 from tkamb.io.recordings.tables import Table, read_table
 from tkamb.units import DEGREE, MILLIMETRE
 

@@ -20,9 +20,9 @@ from tkamb.io.recordings.recording_tables import (
     MeasuredTable,
     MotionTable,
     PatientTable,
+    SceneTable,
     TibiaTable,
 )
-from tkamb.io.recordings.scene_table import SceneTable
 from tkamb.io.scene.tables import (
     ContactTable,
     GenericLigamentsTable,

@@ -9,7 +9,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from tkamb.io.recordings.scene_table import Count, Number, SceneTable
+from tkamb.io.recordings.recording_tables import Count, Number, SceneTable
 
 Length = Annotated[Number, Field(ge=0, le=50)]
 Angle = Annotated[Number, Field(ge=0, le=20)]

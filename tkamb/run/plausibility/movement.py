@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_pose
+from tkamb.io.recordings.filtering import OddSample
 from tkamb.io.recordings.recording_tables import GroundReactionTable
-from tkamb.io.recordings.samples import OddSample
 from tkamb.io.scene.case import Case
 from tkamb.run.plausibility import Question
 from tkamb.units import DEGREE, MILLIMETRE

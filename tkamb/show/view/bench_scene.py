@@ -19,12 +19,16 @@ from tkamb.geometry.frames import KNEE_COORDINATES, Array, inverse, pose
 from tkamb.geometry.surface import Surface
 from tkamb.io.given_material import LAW_KEYS, material_as_json
 from tkamb.io.recordings.motion import KneeMotion
-from tkamb.io.recordings.recording_tables import GroundReactionTable, MotionTable, TibiaTable
-from tkamb.io.recordings.scene_table import SceneTable
+from tkamb.io.recordings.recording_tables import (
+    GroundReactionTable,
+    MotionTable,
+    SceneTable,
+    TibiaTable,
+)
 from tkamb.io.scene.case import Case
 from tkamb.io.scene.parts import wrap_table
 from tkamb.io.scene.tables import STIFFNESS_KEYS
-from tkamb.io.starter.person import Person, patient_urdf
+from tkamb.io.starter import Person, patient_urdf
 from tkamb.io.toml_text import table_lines
 from tkamb.knee.knee import Knee
 from tkamb.knee.ligament_laws import law_name

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from tkamb.geometry.frames import MIRROR, Array, inverse, pose, transform
 from tkamb.geometry.surface import Surface
-from tkamb.io.recordings.vtp import read_vtp, read_vtp_values
+from tkamb.io.recordings.polygon_files import read_vtp, read_vtp_values
 from tkamb.io.scene.case import Case
 from tkamb.knee.chain import ChainState
 from tkamb.knee.equations import KneeGeometry

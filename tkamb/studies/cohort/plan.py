@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from tkamb.errors import InputError, names_near
 from tkamb.files import sha256_of
-from tkamb.io.recordings.scene_table import Count, Number, SceneTable
+from tkamb.io.recordings.recording_tables import Count, Number, SceneTable
 from tkamb.io.scene import Scene, load_scene
 from tkamb.io.toml_text import read_toml
 from tkamb.run.frame_choice import frames_slice

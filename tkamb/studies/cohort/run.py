@@ -26,9 +26,8 @@ from tkamb.run.identity import CONTACT_CODE, contact_code
 from tkamb.run.recorder import Shards
 from tkamb.run.results_folder import remove_shards
 from tkamb.run.workers import PoolOptions, Progress, Task
-from tkamb.studies.cohort.outcome import CohortWorker, Outcome
+from tkamb.studies.cohort.outcome import CohortWorker, Group, Outcome, group_rows, groups_of
 from tkamb.studies.cohort.plan import GROUP_AXES, Cohort, CohortRun, load_cohort
-from tkamb.studies.cohort.statistics import Group, group_rows, groups_of
 
 try:
     import pyarrow as pa

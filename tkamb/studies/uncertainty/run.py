@@ -44,14 +44,17 @@ from tkamb.studies.uncertainty.bands import (
     peak_band,
     unbalanced_patella,
 )
-from tkamb.studies.uncertainty.inputs import VariedInput, held_inputs, uncertainty_of, varied_inputs
-from tkamb.studies.uncertainty.sample import BandWorker, Sample
-from tkamb.studies.uncertainty.sampling import (
+from tkamb.studies.uncertainty.inputs import (
     Point,
+    VariedInput,
     correlation_root,
     crossed_points,
+    held_inputs,
     normal_samples,
+    uncertainty_of,
+    varied_inputs,
 )
+from tkamb.studies.uncertainty.sample import BandWorker, Sample
 from tkamb.studies.uncertainty.sensitivity import SobolIndex, sobol_indices
 
 
@@ -187,7 +190,7 @@ def estimate_uncertainty(
         workers: number of processes; 1: compute in this process.
         dask: address of a Dask scheduler, or "local" for worker processes on this computer,
             `workers` processes.
-        method: "lhs" or "sobol", see `tkamb.studies.uncertainty.sampling`.
+        method: "lhs" or "sobol", see `tkamb.studies.uncertainty.inputs`.
         indices: whether to compute Sobol' indices with Saltelli's design. With d inputs
             `samples` (d + 2) samples are computed, and the bands use 2 `samples` of them.
         frames: slice of the frames; default: all.

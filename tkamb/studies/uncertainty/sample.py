@@ -49,12 +49,14 @@ from tkamb.studies.uncertainty.inputs import (
     PATELLAR_LIGAMENT,
     UNITS,
     Draw,
+    Point,
     VariedInput,
+    correlation_root,
+    noise_of_point,
     pose_names,
     uncertainty_of,
     varied_inputs,
 )
-from tkamb.studies.uncertainty.sampling import Point, correlation_root, noise_of_point
 from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:

@@ -16,9 +16,8 @@ from tkamb.run.results import MIN_SAMPLES
 from tkamb.run.simulation import chosen_frames
 from tkamb.run.workers import PoolOptions, Progress, Task
 from tkamb.studies.uncertainty.bands import varies
-from tkamb.studies.uncertainty.inputs import VariedInput, varied_inputs
+from tkamb.studies.uncertainty.inputs import VariedInput, one_at_a_time, varied_inputs
 from tkamb.studies.uncertainty.sample import Sample, Sampler
-from tkamb.studies.uncertainty.sampling import one_at_a_time
 
 RESAMPLED = 200
 """Number of bootstrap samples for the standard errors."""
@@ -64,7 +63,7 @@ def sobol_indices(
     Args:
         results: names of the m results.
         values: values of the samples, shape (n (d + 2), m, f), in the order of
-            `tkamb.studies.uncertainty.sampling.crossed_points`.
+            `tkamb.studies.uncertainty.inputs.crossed_points`.
         count: number n of rows of the design.
         seed: seed of the bootstrap.
 

@@ -20,15 +20,12 @@ from tkamb.run.recorder import Shard, Shards
 from tkamb.run.results import MIN_SAMPLES
 from tkamb.run.workers import Numbered, PoolOptions, Task
 from tkamb.studies.uncertainty.bands import percentiles
-from tkamb.studies.uncertainty.inputs import Draw, VariedInput
-from tkamb.studies.uncertainty.sampling import correlation_root, normal_samples
-from tkamb.studies.wear.engine import ContactEngine
-from tkamb.studies.wear.laws import WearLaw
-from tkamb.studies.wear.materials import LogarithmicCreep
+from tkamb.studies.uncertainty.inputs import Draw, VariedInput, correlation_root, normal_samples
+from tkamb.studies.wear.engine import ContactEngine, SlidingHistory
+from tkamb.studies.wear.laws import LogarithmicCreep, WearLaw
 from tkamb.studies.wear.motion import CycleMotion
 from tkamb.studies.wear.setup import WearSetup
 from tkamb.studies.wear.simulation import WearCase, simulate_wear
-from tkamb.studies.wear.sliding import SlidingHistory
 
 BANDED = ("volume_mm3", "mass_mg", "max_depth_mm", "creep_depth_mm", "creep_volume_mm3")
 """Columns of wear.csv that have a band."""
@@ -233,7 +230,7 @@ class Sampling:
 
     Args:
         root: Cholesky factor of the correlation matrix, shape (d, d), see
-            `tkamb.studies.uncertainty.sampling`.
+            `tkamb.studies.uncertainty.inputs`.
         seed: seed of the random numbers.
         constant_share: share of the variance of a pose error that is constant over the frames.
     """

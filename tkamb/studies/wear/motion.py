@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from tkamb.errors import InputError, names_near
 from tkamb.geometry.frames import Array, inverse, knee_coordinates, knee_pose
-from tkamb.io.recordings.scene_table import DEFAULT_CLOSING, Closing
+from tkamb.io.recordings.recording_tables import DEFAULT_CLOSING, Closing
 from tkamb.studies.wear.simulator import ForceDrive
 from tkamb.units import MILLIMETRE
 

@@ -14,11 +14,10 @@ from tkamb import code_identity
 from tkamb.files import replaced_together, write_rows, write_synced
 from tkamb.geometry.frames import MIRROR, Array
 from tkamb.geometry.surface import Surface
-from tkamb.io.vtk import write_triangles
+from tkamb.io.mesh_files import write_triangles
 from tkamb.run.results_folder import remove_shards
 from tkamb.studies.wear.bands import WearBands
-from tkamb.studies.wear.laws import WearLaw
-from tkamb.studies.wear.materials import WearMaterial
+from tkamb.studies.wear.laws import WearLaw, WearMaterial
 from tkamb.studies.wear.setup import WearSetup
 from tkamb.studies.wear.simulation import CycleWear, FirstCycle, WearCase, WearState
 from tkamb.studies.wear.simulator import UNITS

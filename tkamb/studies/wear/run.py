@@ -25,8 +25,7 @@ from tkamb.run.recorder import Shards, read_arrays
 from tkamb.run.results import Results
 from tkamb.run.workers import PoolOptions
 from tkamb.studies.wear.bands import WEAR_BAND, Progress, Sampling, check_samples
-from tkamb.studies.wear.laws import WearLaw
-from tkamb.studies.wear.materials import DEFAULT_MATERIAL, WearMaterial, wear_material
+from tkamb.studies.wear.laws import DEFAULT_MATERIAL, WearLaw, WearMaterial, wear_material
 from tkamb.studies.wear.report import SAMPLES_NAME, STATE_NAME, WearReport
 from tkamb.studies.wear.setup import WearSetup, setup_of_results, wear_setup
 from tkamb.studies.wear.simulation import (
@@ -229,7 +228,7 @@ def prepare_wear(
         updates: number of updates of the insert's geometry.
         law: name of a wear law (`tkamb.studies.wear.laws`); None: that of [wear] in the scene, or
             the default law of the material.
-        material: name (`tkamb.studies.wear.materials`) or file of a wear material; None: that of
+        material: name (`tkamb.studies.wear.laws`) or file of a wear material; None: that of
             [wear] in the scene, or "conventional".
         wear_factor: wear factor that replaces that of scene or material, mm³/(N m).
         samples: number of samples for bands, at least 20; 0: no bands; None: 32 if the scene has

@@ -10,11 +10,9 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.geometry.surface import Surface
-from tkamb.studies.wear.engine import CycleMaps, interpolation, scaled_to_load
-from tkamb.studies.wear.laws import WearLaw
-from tkamb.studies.wear.materials import LogarithmicCreep
+from tkamb.studies.wear.engine import CycleMaps, SlidingHistory, interpolation, scaled_to_load
+from tkamb.studies.wear.laws import LogarithmicCreep, WearLaw
 from tkamb.studies.wear.motion import CycleMotion
-from tkamb.studies.wear.sliding import SlidingHistory
 from tkamb.studies.wear.worn_surface import ArticularSurface, volume
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
