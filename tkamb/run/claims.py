@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tkamb.geometry.frames import Array, Mask
-from tkamb.run import texts
+from tkamb.io import texts
 from tkamb.run.status import AGREEMENT
 
 if TYPE_CHECKING:

@@ -12,11 +12,11 @@ import numpy as np
 
 from tkamb import __version__
 from tkamb.geometry.frames import SIDES
+from tkamb.io import texts
 from tkamb.io.recordings.gait_cycle import CONTACT_FORCE_N, cycle_percent
 from tkamb.io.scene.case import Case
 from tkamb.io.scene.scene import Scene
 from tkamb.io.scene.tables import ContactTable
-from tkamb.run import texts
 from tkamb.run.claims import claims_summary
 from tkamb.run.columns import (
     ACTIVATION,

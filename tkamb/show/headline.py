@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tkamb.geometry.frames import SIDES, Array
-from tkamb.run import claims, metrics, texts
+from tkamb.io import texts
+from tkamb.run import claims, metrics
 from tkamb.run.known_errors import is_large, short_error_words
 from tkamb.run.status import AGREEMENT
 from tkamb.show.axis import HorizontalAxis, horizontal_axis

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from tkamb.errors import InputError
+from tkamb.io import texts
 from tkamb.knee.ligament_laws import LIGAMENT_LAWS
-from tkamb.run import texts
 from tkamb.run.claims import compared_forces, method_error
 from tkamb.run.columns import WITHOUT_MUSCLES
 

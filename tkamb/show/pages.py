@@ -12,7 +12,7 @@ from typing import Any
 
 from markupsafe import Markup, escape
 
-from tkamb.run.texts import environment
+from tkamb.io.texts import environment
 
 
 def asset(package: str, name: str) -> str:

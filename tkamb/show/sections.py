@@ -12,7 +12,8 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.files import MEGABYTE, read_bytes, read_json
 from tkamb.geometry.frames import Array
-from tkamb.run import metrics, texts
+from tkamb.io import texts
+from tkamb.run import metrics
 from tkamb.run.claims import compared_forces, method_error, peaks_of, split_of
 from tkamb.run.known_errors import is_large, known_error_words
 from tkamb.run.metrics import body_weight, medial_share, residual_share, tension_ratio

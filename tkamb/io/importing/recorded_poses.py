@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from tkamb.errors import InputError
 from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import (
-    KNEE_COORDINATES,
     Array,
     inverse,
     knee_coordinates,
@@ -37,7 +36,6 @@ from tkamb.io.recordings.meshes import axes_rotation
 from tkamb.io.recordings.motion import KneeMotion, load_motion
 from tkamb.io.recordings.recording_tables import MotionTable
 from tkamb.io.recordings.tables import Table
-from tkamb.io.toml_text import toml_markers, toml_mm, toml_value
 from tkamb.units import DEGREE, MILLIMETRE
 
 MOTION_FILE = "motion.csv"
@@ -145,30 +143,19 @@ def model_feet(links: Links, recorded: Table) -> Feet:
     return Feet(recorded.path, recorded.time(), middles)
 
 
-def motion_tables(flexion_alone: bool) -> list[str]:
-    """Return the scene's tables [motion.columns] and [tibia] for `motion.csv`.
+@dataclass(frozen=True, eq=False)
+class JointCentre:
+    """A joint centre that stands for a marker of the shank.
 
     Args:
-        flexion_alone: whether the scene reads only flexion; otherwise it reads six coordinates.
+        markers: label of a marker of the neighbouring segment -> its place there, m, shape (3,).
+        place: the centre in the same frame, m, shape (3,).
+        in_tibia: the centre in the tibia link, m, shape (3,).
     """
-    columns = dict(zip(KNEE_COORDINATES, COLUMNS, strict=False))
-    names = ("flexion",) if flexion_alone else KNEE_COORDINATES
-    lines = ["[motion.columns]", 'time = "time_s"']
-    lines += [f'{role} = "{columns[role]}"' for role in names]
-    lines += [
-        "",
-        "[tibia]",
-        'kind = "pose"',
-        f'file = "{MOTION_FILE}"',
-        'sequence = "XYZ"',
-        'angle_unit = "deg"',
-        'length_unit = "mm"',
-        "",
-        "[tibia.columns]",
-        'time = "time_s"',
-    ]
-    kinds = [f"{kind}_{k}" for kind in ("rotation", "translation") for k in (1, 2, 3)]
-    return lines + [f'{role} = "{name}"' for role, name in zip(kinds, COLUMNS[6:], strict=True)]
+
+    markers: Mapping[str, Array]
+    place: Array
+    in_tibia: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,24 +165,15 @@ class ShankMarkers:
     Args:
         axes: axes of the file that point forward, up and right.
         points: label of a marker -> its position in the tibia link, m, shape (3,).
-        centres: name of a joint centre that is used as a further marker -> lines of the scene's
-            table [[tibia.joint_centre]].
+        centres: name of a joint centre -> the centre.
         remarks: lines for the report on the joint centres.
     """
 
     path: Path
     axes: str
     points: dict[str, Array]
-    centres: dict[str, list[str]]
+    centres: dict[str, JointCentre]
     remarks: tuple[str, ...]
-
-    def lines(self, path: str) -> list[str]:
-        """Return the scene's table [tibia]; `path` is the recording's path as TOML."""
-        lines = ["[tibia]", 'kind = "markers"', f"file = {path}"]
-        lines += [f'laboratory_axes = "{self.axes}"', f"markers_mm = {toml_markers(self.points)}"]
-        for centre in self.centres.values():
-            lines += ["", *centre]
-        return lines
 
 
 def shank_markers(
@@ -221,7 +199,7 @@ def shank_markers(
         InputError: there are fewer than three points.
     """
     points = segments["shank"].points
-    centres: dict[str, list[str]] = {}
+    centres: dict[str, JointCentre] = {}
     text: list[str] = []
     if len(points) < 3:
         centres, text = _joint_centres(links, segments, femur)
@@ -237,15 +215,13 @@ def shank_markers(
 
 def _joint_centres(
     links: Links, segments: Mapping[str, ModelSegment], femur: Array
-) -> tuple[dict[str, list[str]], list[str]]:
+) -> tuple[dict[str, JointCentre], list[str]]:
     """Return the joint centres from the markers of foot and thigh, and remarks on them."""
     foot, thigh, leg = segments["foot"], segments["thigh"], links.leg
-    centres: dict[str, list[str]] = {}
+    centres: dict[str, JointCentre] = {}
     text = []
     if len(foot.points) >= 3 and foot.centre is not None:
-        centres["ankle_centre"] = _centre_lines(
-            "ankle_centre", foot.points, foot.centre, np.zeros(3)
-        )
+        centres["ankle_centre"] = JointCentre(foot.points, foot.centre, np.zeros(3))
         text.append(f"shank: the foot's {len(foot.points)} markers give its ankle centre")
     if len(thigh.points) >= 3:
         markers = {name: transform(links.femur, point) for name, point in thigh.points.items()}
@@ -253,24 +229,12 @@ def _joint_centres(
         places = transform(femur, centre)
         mean = places.mean(axis=0)
         spread = np.sqrt(((places - mean) ** 2).sum(axis=1).mean()) / MILLIMETRE
-        centres["knee_centre"] = _centre_lines("knee_centre", markers, centre, mean)
+        centres["knee_centre"] = JointCentre(markers, centre, mean)
         text.append(
             f"shank: the thigh's {len(markers)} markers give its knee centre, at the mean of "
             f"{len(places)} recorded poses ({spread:.1f} mm rms about it)"
         )
     return centres, text
-
-
-def _centre_lines(
-    name: str, markers: Mapping[str, Array], centre: Array, tibia: Array
-) -> list[str]:
-    return [
-        "[[tibia.joint_centre]]",
-        f"name = {toml_value(name)}",
-        f"markers_mm = {toml_markers(markers)}",
-        f"centre_mm = {toml_mm(centre)}",
-        f"tibia_mm = {toml_mm(tibia)}",
-    ]
 
 
 ROLES = tuple(f"{kind}_{k}" for kind in ("rotation", "translation") for k in (1, 2, 3))
@@ -302,6 +266,11 @@ class PoseRecording:
     turned: tuple[str, ...] = ()
     stride: tuple[float, float] | None = None
     stance: tuple[float, float] | None = None
+
+    @property
+    def roles(self) -> dict[str, str]:
+        """Role of a column -> its name."""
+        return dict(zip(ROLES, self.columns, strict=True))
 
     def keys(self) -> dict[str, Any]:
         """Return the scene's table [motion] without file, cut-off frequency, interval, columns."""
@@ -336,19 +305,6 @@ class RecordedPoses:
     femur: Array
     in_stance: Array
     remarks: tuple[str, ...]
-
-    def motion_lines(self, path: str, cutoff_Hz: float) -> list[str]:
-        """Return the scene's table [motion]; `path` is the file's path as TOML."""
-        lines = ["[motion]", f"file = {path}", f"cutoff_Hz = {cutoff_Hz:g}"]
-        for key, value in self.given.keys().items():
-            if key == "cycle_s":
-                lines.append("# s, assumed times of the recording at 0 and 100 %")
-            lines.append(f"{key} = {toml_value(value)}")
-        if self.interval:
-            lines.append(f"interval_s = {toml_value(self.interval)}")
-        lines += ["", "# the femoral mesh in the insert mesh's own axes", "[motion.columns]"]
-        named = zip(ROLES, self.given.columns, strict=True)
-        return lines + [f"{role} = {toml_value(column)}" for role, column in named]
 
 
 def read_poses(
@@ -396,7 +352,7 @@ def _motion_table(
         "cutoff_Hz": cutoff_Hz,
         "interval_s": interval,
     }
-    keys["columns"] = dict(zip(ROLES, recording.columns, strict=True))
+    keys["columns"] = recording.roles
     return MotionTable.model_validate(keys)
 
 

@@ -1,23 +1,28 @@
 """Files and options of an import, and the text of its scene file with all inferred values."""
 
 import os
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from tkamb.geometry.frames import Array
+from scipy.spatial.transform import Rotation
+
+from tkamb.geometry.frames import KNEE_COORDINATES
 from tkamb.io.importing.links import Links, body_link
 from tkamb.io.importing.markers import ModelSegment
 from tkamb.io.importing.recorded_poses import (
+    COLUMNS,
     MOTION_FILE,
+    ROLES,
     PoseRecording,
     RecordedPoses,
     ShankMarkers,
-    motion_tables,
 )
-from tkamb.io.importing.soft_tissue import End, SoftTissue
+from tkamb.io.importing.soft_tissue import SoftTissue
 from tkamb.io.recordings.laboratory import GivenUnits
 from tkamb.io.scene.parts import wrap_table
+from tkamb.io.texts import environment
 from tkamb.io.toml_text import toml_markers, toml_mm, toml_value
 from tkamb.units import DEGREE
 
@@ -138,250 +143,38 @@ class SceneText:
 
     def text(self) -> str:
         """Return the text of the scene file."""
-        tables = [
-            [f"# {line}" for line in self.title],
-            self._patient(),
-            self._motion(),
-            *self._segments(),
-            self.shank.lines(self._path(self.shank.path)) if self.shank else [],
-            self._ground(),
-            *self._implant(),
-            self._muscles(),
-            self._all_muscles(),
-            self._ligaments(),
-            self._contact(),
-            self._uncertainty(),
-            self._output(),
-        ]
-        return "\n\n".join("\n".join(lines) for lines in tables if lines) + "\n"
-
-    def _path(self, path: Path) -> str:
-        return toml_value(Path(os.path.relpath(path.absolute(), self.folder.absolute())).as_posix())
-
-    def _patient(self) -> list[str]:
-        return [
-            "[patient]",
-            f"urdf = {toml_value(self.urdf)}",
-            f'side = "{self.side}"',
-            f"mass_kg = {self.mass_kg:g}",
-        ]
-
-    def _motion(self) -> list[str]:
-        m, neutral = self.markers, self.links.neutral
-        if self.poses is not None:
-            return self.poses.motion_lines(self._path(self.poses.given.file), self.cutoff_Hz)
-        if m is None:
-            head = ["[motion]", f'file = "{MOTION_FILE}"', 'interpretation = "coordinates"']
-            head += ['angle_unit = "deg"', 'length_unit = "mm"', f"cutoff_Hz = {self.cutoff_Hz:g}"]
-            return [*head, "", *motion_tables(self.meshes is not None)]
-        lines = ["[motion]", f"file = {self._path(m.path)}", 'interpretation = "markers"']
-        lines += [f'length_unit = "{m.length_unit}"'] if m.length_unit else []
-        lines.append(f"cutoff_Hz = {self.cutoff_Hz:g}")
-        if m.interval:
-            lines.append(
-                "# s, times of the file at which every surface under the foot was measured"
-            )
-            lines.append(f"interval_s = [{m.interval[0]:.9f}, {m.interval[1]:.9f}]")
-        if m.frames:
-            lines.append(
-                "# every k-th frame: five frames per period of the cut-off frequency are enough"
-            )
-            lines.append(f"frames = {m.frames}")
-        coordinates = ["flexion"] if self.meshes else _ALL
-        lines += [
-            "",
-            "[motion.markers]",
-            f'method = "{m.method}"  # "segments": shank and thigh separately; or "chain"',
-            f'knee = "{m.knee}"',
-            f"coordinates = {toml_value(coordinates)}",
-            "# position and rotation of the straight knee in the model",
-            f"neutral_mm = {toml_mm(neutral[:3])}",
-            f"neutral_deg = {toml_value(neutral[3:5] / DEGREE, 3)}",
-            f'laboratory_axes = "{m.axes}"',
-        ]
-        return lines
-
-    def _segments(self) -> list[list[str]]:
-        m = self.markers
-        return [_segment(segment, m.whole_labels) for segment in m.segments] if m else []
-
-    def _ground(self) -> list[str]:
-        g = self.ground
-        if g is None:
-            return []
-        file = toml_value(GROUND_FILE) if g.made else self._path(g.path)
-        lines = ["[ground_reaction]", f"file = {file}"]
-        lines += [f"plates = {list(g.plates)}"] if g.plates else []
-        length = g.length_unit or g.units.length
-        lines += [f'length_unit = "{length}"'] if length else []
-        for key, unit in (("force_unit", g.units.force), ("moment_unit", g.units.moment)):
-            lines += [f"{key} = {toml_value(unit)}"] if unit else []
-        lines += [
-            f'laboratory_axes = "{g.axes}"',
-            f"cutoff_Hz = {self.cutoff_Hz:g}",
-            "unloaded_N = 40.0",
-        ]
-        if g.surface:
-            lines.append("# the foot stands on a step of about this height above the plate")
-            lines.append(f"surface_mm = {round(g.surface * 1e3, -1):.0f}")
-        if g.columns:
-            lines += ["", "[ground_reaction.columns]"]
-            lines += [f"{role} = {toml_value(column)}" for role, column in g.columns]
-        return lines
-
-    def _implant(self) -> list[list[str]]:
-        m = self.meshes
-        if m is None:
-            return []
-        parts: list[list[str]] = []
-        for name, path in (("femoral", m.femoral), ("insert", m.insert), ("patella", m.patella)):
-            if path is None:
-                continue
-            lines = [f"[implant.{name}]", f"mesh = {self._path(path)}", f'unit = "{m.unit}"']
-            lines.append(f'axes = "{m.axes}"')
-            if name == "insert":
-                lines.append('bearing = "fixed"')
-            if name == "patella":
-                lines += _button(self.links.button_in_patella)
-            parts.append(lines)
-        return parts
-
-    def _muscles(self) -> list[str]:
-        t = self.tissue
-        if not self._with_patella:
-            return []
-        assert t.quadriceps is not None and t.patellar_ligament is not None
-        return [
-            "[quadriceps]",
-            _end("origin", t.quadriceps[0]),
-            _end("insertion", t.quadriceps[1]),
-            *self._bone(),
-            "",
-            "[patellar_ligament]",
-            _end("proximal", t.patellar_ligament[0]),
-            _end("distal", t.patellar_ligament[1]),
-            f"length_mm = {t.ligament_length * 1e3:.3f}",
-            "",
-            "[patella]",
-            'motion = "solved"',
-        ]
-
-    def _all_muscles(self) -> list[str]:
-        if self.model is None:
-            return []
-        lines = [
-            "# all muscles of the model share the load; see docs/muscles.md",
-            "[muscles]",
-            f"model = {self._path(self.model)}",
-        ]
-        if self.coordinates is not None:
-            lines.append(f"coordinates = {self._path(self.coordinates)}")
-        return lines
-
-    def _bone(self) -> list[str]:
-        m = self.meshes
-        if m is None or m.femur_bone is None:
-            return []
-        link = toml_value(body_link(self.links.leg.femur[0]))
-        mesh = f'mesh = {self._path(m.femur_bone)}, unit = "{m.unit}"'
-        return [
-            "# bone that the line may wrap, as well as the component",
-            f"bone = {{ {mesh}, link = {link} }}",
-        ]
-
-    @property
-    def _with_patella(self) -> bool:
-        t, m = self.tissue, self.meshes
-        return bool(m and m.patella and t.quadriceps and t.patellar_ligament)
-
-    def _ligaments(self) -> list[str]:
-        if self.tissue.bundles:
-            lines: list[str] = []
-            for b in self.tissue.bundles:
-                lines += [
-                    "",
-                    "[[ligament]]",
-                    f"name = {toml_value(b.name)}",
-                    'law = "quadratic-toe"',
-                ]
-                lines += [_end("proximal", b.proximal), _end("distal", b.distal)]
-                lines.append(f"stiffness_N_per_strain = {b.stiffness_N:g}")
-                lines.append(f"slack_length_mm = {b.slack_length_m * 1e3:.4f}")
-                if b.wraps:
-                    tables = ", ".join(toml_value(wrap_table(wrap), 6) for wrap in b.wraps)
-                    lines.append(f"wrap = [{tables}]")
-            return lines[1:]
-        if self.meshes is None:
-            return []
-        return [
-            "# The model has none: a generic set, scaled to the implant, not the patient's own.",
-            "[generic_ligaments]",
-            'ligaments = ["MCL", "LCL", "PCL"]',
-        ]
-
-    def _contact(self) -> list[str]:
-        if self.meshes is None:
-            return []
-        lines = [
-            "[contact]",
-            f'model = "{self.contact}"',
-            "resolution_mm = 1.0",
-            'material = "polyethylene"',
-        ]
-        if self.poses is not None:
-            return lines
-        return [
-            *lines,
-            "# not recorded: the equilibrium of contact, ligaments and muscle line gives them",
-            'released = ["adduction", "axial_rotation", "ap", "ml"]',
-        ]
-
-    def _uncertainty(self) -> list[str]:
-        if not self.uncertainty:
-            return []
-        values = [f"{key} = {value:g}" for key, value in self.uncertainty.items()]
-        return ["# what the registration of the markers leaves open", "[uncertainty]", *values]
-
-    def _output(self) -> list[str]:
-        stride = self.poses is not None and self.poses.given.stride is not None
-        axis = "cycle" if stride or self.cycle is not None else "time"
-        lines = ["[output]", f'axis = "{axis}"']
-        if self.cycle == "plates":
-            lines.append("# 0 and 100 %: two foot strikes on the force plates")
-        elif self.cycle is not None:
-            lines.append(f"cycle_s = [{self.cycle[0]:g}, {self.cycle[1]:g}]")
-        lines += [f"activity = {toml_value(self.activity)}"] if self.activity else []
-        return [*lines, "notes = [", *(f"    {toml_value(note)}," for note in self.notes), "]"]
-
-
-_ALL = ["flexion", "adduction", "axial_rotation", "ap", "si", "ml"]
-
-
-def _end(key: str, end: End) -> str:
-    return f"{key} = {{ link = {toml_value(end.link)}, point_mm = {toml_mm(end.point)} }}"
-
-
-def _segment(segment: ModelSegment, whole_labels: bool) -> list[str]:
-    lines = ["[[motion.markers.segment]]", f'name = "{segment.name}"']
-    if segment.joint is not None and segment.centre is not None:
-        lines += [
-            f'joined_to = "{segment.joined_to}"',
-            f"joint_mm = {toml_mm(segment.joint)}",
-            f"centre_mm = {toml_mm(segment.centre)}",
-        ]
-    return [*lines, f"markers_mm = {toml_markers(segment.points, whole_labels)}"]
-
-
-def _button(in_patella: Array | None) -> list[str]:
-    from scipy.spatial.transform import Rotation
-
-    if in_patella is None:
-        return []
-    angles = Rotation.from_matrix(in_patella[:3, :3]).as_euler("XYZ") / DEGREE
-    return [
-        f"position_mm = {toml_mm(in_patella[:3, 3])}",
-        f"rotation_deg = {toml_value(angles, 3)}",
-    ]
+        meshes, button = self.meshes, self.links.button_in_patella
+        parts = (
+            {"femoral": meshes.femoral, "insert": meshes.insert, "patella": meshes.patella}
+            if (meshes)
+            else {}
+        )
+        template = environment("tkamb.io.importing", html=False).overlay()
+        template.filters = template.filters | {
+            "toml": toml_value,
+            "mm": toml_mm,
+            "markers": toml_markers,
+            "degrees": lambda angles: toml_value(angles / DEGREE, 3),
+            "path": lambda path: toml_value(
+                Path(os.path.relpath(path.absolute(), self.folder.absolute())).as_posix()
+            ),
+            "wraps": lambda wraps: toml_value([wrap_table(wrap) for wrap in wraps], 6),
+        }
+        text = template.get_template("scene.toml").render(
+            s=self,
+            motion_file=MOTION_FILE,
+            ground_file=GROUND_FILE,
+            motion_columns=dict(zip(KNEE_COORDINATES, COLUMNS, strict=False)),
+            tibia_columns=dict(zip(ROLES, COLUMNS[6:], strict=True)),
+            implant=[(name, path) for name, path in parts.items() if path is not None],
+            button=button is not None
+            and {
+                "place": button[:3, 3],
+                "angles": Rotation.from_matrix(button[:3, :3]).as_euler("XYZ"),
+            },
+            bone_link=body_link(self.links.leg.femur[0]),
+        )
+        return re.sub(r"\n{3,}", "\n\n", text).strip("\n") + "\n"
 
 
 @dataclass(frozen=True)
