@@ -7,7 +7,8 @@ import pytest
 import tkamb
 from tkamb.cli import main
 from tkamb.errors import InputError
-from tkamb.io.starter import Person, lay_out
+from tkamb.io.starter import lay_out
+from tkamb.io.starter.person import Person
 
 FRAMES = slice(0, 6, 5)
 

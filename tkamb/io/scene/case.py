@@ -288,12 +288,12 @@ def _derived(scene: Scene, motion: KneeMotion, parts: ImplantParts) -> KneeMotio
     if motion.unrecorded or table.motion == "roll-slip":
         check_frames(motion.time, table.cutoff_Hz, table.frames)
     if motion.unrecorded:
-        from tkamb.io.recordings.motion import seated_motion
+        from tkamb.io.scene.derived_motion import seated_motion
 
         assert parts.femoral is not None and parts.insert is not None
         motion = seated_motion(motion, parts.femoral, parts.insert, table.cutoff_Hz)
     if table.motion == "roll-slip":
-        from tkamb.io.recordings.motion import rolling_motion
+        from tkamb.io.scene.derived_motion import rolling_motion
 
         assert parts.femoral is not None and parts.insert is not None
         motion = rolling_motion(

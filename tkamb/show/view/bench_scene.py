@@ -28,7 +28,7 @@ from tkamb.io.recordings.recording_tables import (
 from tkamb.io.scene.case import Case
 from tkamb.io.scene.parts import wrap_table
 from tkamb.io.scene.tables import STIFFNESS_KEYS
-from tkamb.io.starter import Person, patient_urdf
+from tkamb.io.starter.person import Person, patient_urdf
 from tkamb.io.toml_text import table_lines
 from tkamb.knee.knee import Knee
 from tkamb.knee.ligament_laws import law_name
