@@ -19,6 +19,7 @@ from tkamb.commands.options import (
     add_preset,
     add_scene_options,
     check_options,
+    option,
     overrides_of,
 )
 from tkamb.commands.results import (
@@ -127,29 +128,19 @@ def _add_run(commands: Any) -> None:
     add_scene_options(run)
     add_preset(run)
     add_no_cache(run)
-    run.add_argument(
-        "--force", action="store_true", help="write into a folder that tkamb did not make"
-    )
-    run.add_argument("--resume", action="store_true", help="go on with an interrupted run")
-    run.add_argument(
-        "--workers", type=int, default=1, metavar="N", help="number of processes for the frames"
-    )
-    run.add_argument(
-        "--profile",
-        action="store_true",
-        help="list the files and modules used, and the time of each part",
-    )
-    run.add_argument(
-        "--pack", type=Path, metavar="F.zip", help="write results, scene and inputs into an archive"
-    )
-    run.add_argument("--strict", action="store_true", help="exit 1 when a frame failed")
-    run.add_argument("--json", action="store_true", help="print summary.json")
+    option(run, "--force", "write into a folder that tkamb did not make")
+    option(run, "--resume", "go on with an interrupted run")
+    option(run, "--workers N", "number of processes for the frames", int, default=1)
+    option(run, "--profile", "list the files and modules used, and the time of each part")
+    option(run, "--pack F.zip", "write results, scene and inputs into an archive", Path)
+    option(run, "--strict", "exit 1 when a frame failed")
+    option(run, "--json", "print summary.json")
     run.set_defaults(command=_run)
 
 
 def _add_scene(commands: Any) -> None:
     scene = commands.add_parser("scene", help="the scene file")
-    scene.add_argument("--schema", action="store_true", required=True, help="print its JSON schema")
+    option(scene, "--schema", "print its JSON schema", required=True)
     scene.set_defaults(command=_scene)
 
 

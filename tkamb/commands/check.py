@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tkamb.commands.options import add_force, add_set
+from tkamb.commands.options import add_force, add_set, option
 from tkamb.errors import InputError
 
 if TYPE_CHECKING:
@@ -25,12 +25,10 @@ def add_check(commands: Any) -> None:
     """Add `check` to the command line."""
     check = commands.add_parser("check", help="read and check a scene's files, without a run")
     check.add_argument("scene", type=Path, help="scene.toml")
-    check.add_argument(
-        "--out", type=Path, metavar="F", help="picture of the leg: .png, or .html with all findings"
-    )
+    option(check, "--out F", "picture of the leg: .png, or .html with all findings", Path)
     add_set(check)
     add_force(check)
-    check.add_argument("--json", action="store_true", help="print the findings as JSON")
+    option(check, "--json", "print the findings as JSON")
     check.set_defaults(command=_check)
 
 

@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
+from tkamb.commands.options import option
 from tkamb.errors import InputError
 from tkamb.io.datasets import NAMES, read_dataset
 from tkamb.io.scene.tables import Activity
@@ -22,15 +23,13 @@ def add_data(commands: Any) -> None:
     get = verbs.add_parser("get", help="download a data set, or take it from a folder")
     get.add_argument("name", choices=NAMES, help="dm: Grand Challenge subject DM")
     source = get.add_mutually_exclusive_group()
-    source.add_argument(
-        "--from", dest="source", type=Path, metavar="DIR", help="folder of files downloaded by hand"
-    )
-    source.add_argument("--url", metavar="URL", help="address of a mirror with the same paths")
-    get.add_argument(
-        "--to",
-        type=Path,
-        metavar="DIR",
-        help="folder for the data; default: ../shared/data/dm, which the scenes of models/dm use",
+    option(source, "--from DIR", "folder of files downloaded by hand", Path, dest="source")
+    option(source, "--url URL", "address of a mirror with the same paths")
+    option(
+        get,
+        "--to DIR",
+        "folder for the data; default: ../shared/data/dm, which the scenes of models/dm use",
+        Path,
     )
     get.set_defaults(command=_get)
 
@@ -59,235 +58,206 @@ def add_import(commands: Any) -> None:
     command = commands.add_parser("import", help="a patient from an OpenSim model and a recording")
     command.add_argument("model", type=Path, metavar="MODEL.osim", help="an OpenSim model")
     source = command.add_mutually_exclusive_group(required=True)
-    source.add_argument(
-        "--c3d", type=Path, metavar="F", help="recording of markers and force plates"
+    option(source, "--c3d F", "recording of markers and force plates", Path)
+    option(source, "--trc F", "recording of markers", Path)
+    option(source, "--motion F", "motion file of the model's coordinates", Path)
+    option(
+        command,
+        "--grf F",
+        ".mot or .sto of the ground reactions, or OpenSim's list of external loads (.xml)",
+        Path,
     )
-    source.add_argument("--trc", type=Path, metavar="F", help="recording of markers")
-    source.add_argument(
-        "--motion", type=Path, metavar="F", help="motion file of the model's coordinates"
-    )
-    command.add_argument(
-        "--grf",
-        type=Path,
-        metavar="F",
-        help=".mot or .sto of the ground reactions, or OpenSim's list of external loads (.xml)",
-    )
-    command.add_argument(
-        "--grf-force",
-        metavar="NAME,NAME",
-        help="first part of the names of the foot's columns in --grf, like ground_force_2; several "
+    option(
+        command,
+        "--grf-force NAME,NAME",
+        "first part of the names of the foot's columns in --grf, like ground_force_2; several "
         "are summed",
     )
-    command.add_argument(
-        "--static",
-        type=Path,
-        metavar="F",
-        help="standing trial, which gives the marker positions on the segments",
+    option(
+        command,
+        "--static F",
+        "standing trial, which gives the marker positions on the segments",
+        Path,
     )
     registers = command.add_mutually_exclusive_group()
-    registers.add_argument(
+    option(
+        registers,
         "--register",
-        dest="register",
-        action="store_true",
-        default=None,
-        help="find the marker positions on the segments together with the motion; default: where "
+        "find the marker positions on the segments together with the motion; default: where "
         "the markers misfit the model by over 10 mm, or the knee centres by over 20 mm",
+        dest="register",
+        default=None,
     )
-    registers.add_argument(
+    option(
+        registers,
         "--no-register",
+        "use the model's marker positions, or those of --static, in any case",
         dest="register",
         action="store_false",
         default=None,
-        help="use the model's marker positions, or those of --static, in any case",
     )
-    command.add_argument(
-        "--with",
+    option(
+        command,
+        "--with TRIAL",
+        "recordings of the same markers on the same day, which the registration uses as well",
+        Path,
         dest="companions",
-        type=Path,
         nargs="+",
         action="extend",
         default=[],
-        metavar="TRIAL",
-        help="recordings of the same markers on the same day, which the registration uses as well",
     )
-    command.add_argument(
-        "--side", choices=("right", "left"), required=True, help="side of the knee"
-    )
-    command.add_argument(
-        "--mass-kg", type=float, required=True, metavar="KG", help="mass of the subject"
-    )
+    option(command, "--side", "side of the knee", choices=("right", "left"), required=True)
+    option(command, "--mass-kg KG", "mass of the subject", float, required=True)
     for part in ("femoral", "insert", "patella"):
-        command.add_argument(
-            f"--{part}", type=Path, metavar="F", help=f"mesh of the {part} component"
+        option(command, f"--{part} F", f"mesh of the {part} component", Path)
+        option(
+            command, f"--{part}-frame NAME", "body or frame of the model that this mesh belongs to"
         )
-        command.add_argument(
-            f"--{part}-frame",
-            metavar="NAME",
-            help="body or frame of the model that this mesh belongs to",
-        )
-    command.add_argument(
-        "--femur-bone",
-        type=Path,
-        metavar="F",
-        help="mesh of the femur that the quadriceps may wrap",
-    )
-    command.add_argument(
-        "--mesh-unit",
-        "--units",
+    option(command, "--femur-bone F", "mesh of the femur that the quadriceps may wrap", Path)
+    option(
+        command,
+        "--mesh-unit --units",
+        "unit of all meshes; it is never guessed",
         dest="mesh_unit",
         choices=tuple(LENGTH),
-        help="unit of all meshes; it is never guessed",
     )
-    command.add_argument(
-        "--mesh-axes",
-        "--axes",
-        dest="mesh_axes",
-        metavar="ANT,SUP,RIGHT",
-        help="axes of the meshes that point anterior, superior and to the right; write "
+    option(
+        command,
+        "--mesh-axes --axes ANT,SUP,RIGHT",
+        "axes of the meshes that point anterior, superior and to the right; write "
         "--mesh-axes=-x,+y,-z",
+        dest="mesh_axes",
     )
     _add_poses(command)
     _add_inferred(command)
-    command.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="folder of scene and patient.urdf"
-    )
-    command.add_argument(
-        "--scene", default="scene.toml", metavar="NAME", help="name of the scene file"
-    )
-    command.add_argument(
+    option(command, "--out DIR", "folder of scene and patient.urdf", Path, required=True)
+    option(command, "--scene NAME", "name of the scene file", default="scene.toml")
+    option(
+        command,
         "--contact",
+        "the scene's contact model; default: %(default)s",
         choices=("foundation", "lattice"),
         default="foundation",
-        help="the scene's contact model; default: %(default)s",
     )
-    command.add_argument(
+    option(
+        command,
         "--activity",
+        "activity whose published values the report shows",
         choices=get_args(Activity),
-        help="activity whose published values the report shows",
     )
-    command.add_argument(
+    option(
+        command,
         "--muscles",
-        action="store_true",
-        help="all muscles of the model share the load ([muscles]); default: the quadriceps alone",
+        "all muscles of the model share the load ([muscles]); default: the quadriceps alone",
     )
-    command.add_argument(
-        "--cycle",
-        type=_cycle,
+    option(
+        command,
+        "--cycle A:B",
+        "plot against per cent of the gait cycle: 0 and 100 %% at these times (s); without "
+        "A:B, or with the word plates: two foot strikes on the force plates",
+        _cycle,
         nargs="?",
         const="plates",
-        metavar="A:B",
-        help="plot against per cent of the gait cycle: 0 and 100 %% at these times (s); without "
-        "A:B, or with the word plates: two foot strikes on the force plates",
     )
-    command.add_argument(
-        "--note", action="append", default=[], metavar="TEXT", help="sentence for the report"
-    )
+    option(command, "--note TEXT", "sentence for the report", action="append", default=[])
     scale = command.add_mutually_exclusive_group()
-    scale.add_argument(
+    option(
+        scale,
         "--scale-mass",
+        "scale the model's masses to the subject's; default: where they differ by over 1 %%",
         dest="scale",
-        action="store_true",
         default=None,
-        help="scale the model's masses to the subject's; default: where they differ by over 1 %%",
     )
-    scale.add_argument(
+    option(
+        scale,
         "--keep-mass",
+        "use the model's masses unchanged",
         dest="scale",
         action="store_false",
         default=None,
-        help="use the model's masses unchanged",
     )
     command.set_defaults(command=_import)
 
 
 def _add_inferred(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--knee", metavar="JOINT", help="name of the model's femorotibial joint")
-    command.add_argument(
-        "--plates",
-        type=_numbers,
-        metavar="2,3",
-        help="numbers of the force plates under this foot, or the word none",
+    option(command, "--knee JOINT", "name of the model's femorotibial joint")
+    option(
+        command,
+        "--plates 2,3",
+        "numbers of the force plates under this foot, or the word none",
+        _numbers,
     )
-    command.add_argument(
-        "--interval", type=_interval, metavar="A:B", help="part of the recording to use, s"
+    option(command, "--interval A:B", "part of the recording to use, s", _interval)
+    option(
+        command,
+        "--laboratory-axes FORWARD,UP,RIGHT",
+        "axes of the recording that point forward, up, right",
     )
-    command.add_argument(
-        "--laboratory-axes",
-        metavar="FORWARD,UP,RIGHT",
-        help="axes of the recording that point forward, up, right",
+    option(command, "--without A,B", "markers to leave out", _names, default=())
+    option(command, "--marker-prefix NAME", "prefix of the marker labels to use: JW of JW:RHeel")
+    option(
+        command,
+        "--length-unit",
+        "length unit of a .c3d that states none",
+        choices=("m", "cm", "mm"),
     )
-    command.add_argument(
-        "--without", type=_names, default=(), metavar="A,B", help="markers to leave out"
-    )
-    command.add_argument(
-        "--marker-prefix", metavar="NAME", help="prefix of the marker labels to use: JW of JW:RHeel"
-    )
-    command.add_argument(
-        "--length-unit", choices=("m", "cm", "mm"), help="length unit of a .c3d that states none"
-    )
-    command.add_argument("--force-unit", metavar="N", help="force unit of a .c3d that states none")
-    command.add_argument(
-        "--moment-unit", metavar="Nmm", help="moment unit of a .c3d that states none"
-    )
-    command.add_argument(
+    option(command, "--force-unit N", "force unit of a .c3d that states none")
+    option(command, "--moment-unit Nmm", "moment unit of a .c3d that states none")
+    option(
+        command,
         "--method",
+        "fit the markers of thigh and shank separately, or the whole leg as a chain; default: "
+        "segments",
         choices=("segments", "chain"),
         default="segments",
-        help="fit the markers of thigh and shank separately, or the whole leg as a chain; default: "
-        "segments",
     )
-    command.add_argument(
-        "--cutoff-hz",
-        type=float,
+    option(
+        command,
+        "--cutoff-hz HZ",
+        "cut-off of the low-pass filter of markers and forces; default: 6",
+        float,
         default=6.0,
-        metavar="HZ",
-        help="cut-off of the low-pass filter of markers and forces; default: 6",
     )
 
 
 def _add_poses(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "--poses",
-        type=Path,
-        metavar="F",
-        help="recorded poses of the femoral mesh in the axes of the insert mesh",
+    option(
+        command,
+        "--poses F",
+        "recorded poses of the femoral mesh in the axes of the insert mesh",
+        Path,
     )
-    command.add_argument(
-        "--pose-columns",
-        type=_names,
-        metavar="R1,R2,R3,X,Y,Z",
-        help="columns of --poses: three angles, then three positions",
+    option(
+        command,
+        "--pose-columns R1,R2,R3,X,Y,Z",
+        "columns of --poses: three angles, then three positions",
+        _names,
     )
-    command.add_argument(
-        "--pose-sequence",
-        metavar="XYZ",
-        help="sequence of the angles in --poses; upper case: intrinsic (Rx Ry Rz)",
+    option(
+        command,
+        "--pose-sequence XYZ",
+        "sequence of the angles in --poses; upper case: intrinsic (Rx Ry Rz)",
     )
-    command.add_argument(
-        "--pose-units",
-        type=_names,
-        metavar="rad,m",
-        help="units of the angles and positions in --poses",
-    )
-    command.add_argument(
-        "--pose-signs-turned",
-        type=_names,
+    option(command, "--pose-units rad,m", "units of the angles and positions in --poses", _names)
+    option(
+        command,
+        "--pose-signs-turned ROLES",
+        "angles and positions to reverse in sign: rotation_1, …",
+        _names,
         default=(),
-        metavar="ROLES",
-        help="angles and positions to reverse in sign: rotation_1, …",
     )
-    command.add_argument(
-        "--stride",
-        type=_interval,
-        metavar="A:B",
-        help="times of the recording, s, at 0 and 100 %% of the poses",
+    option(
+        command,
+        "--stride A:B",
+        "times of the recording, s, at 0 and 100 %% of the poses",
+        _interval,
     )
-    command.add_argument(
-        "--stance",
-        type=_interval,
-        metavar="A:B",
-        help="part of the poses with a loaded foot, in the unit of their time column; the mean "
+    option(
+        command,
+        "--stance A:B",
+        "part of the poses with a loaded foot, in the unit of their time column; the mean "
         "position of the knee centre in the shank is computed from it",
+        _interval,
     )
 
 

@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from tkamb.commands.options import add_force
+from tkamb.commands.options import add_force, option
 from tkamb.errors import InputError
 from tkamb.io import CONTACT_MODEL
 from tkamb.run.guard import say
@@ -21,12 +21,8 @@ def add_press(commands: Any) -> None:
     press = commands.add_parser("press", help="press two meshes together, without a scene")
     press.add_argument("femoral", type=Path, help="mesh of the femoral component")
     press.add_argument("insert", type=Path, help="mesh of the insert")
-    press.add_argument(
-        "--load",
-        type=float,
-        required=True,
-        metavar="N",
-        help="load (N) along the normal of the insert's bottom",
+    option(
+        press, "--load N", "load (N) along the normal of the insert's bottom", float, required=True
     )
     _add_units(press, "unit of both meshes")
     pose = press.add_mutually_exclusive_group()
@@ -38,53 +34,53 @@ def add_press(commands: Any) -> None:
         help="pose of the femoral mesh in the insert mesh's axes: mesh units, degrees (intrinsic "
         "x-y-z)",
     )
-    pose.add_argument("--pose-file", type=Path, metavar="F", help="file with these six numbers")
-    press.add_argument(
-        "--contact",
+    option(pose, "--pose-file F", "file with these six numbers", Path)
+    option(
+        press,
+        "--contact NAME",
+        "contact model (`tkamb contact list`); default: %(default)s",
         default=CONTACT_MODEL,
-        metavar="NAME",
-        help="contact model (`tkamb contact list`); default: %(default)s",
     )
     add_no_cache(press)
-    press.add_argument(
-        "--resolution",
-        type=float,
+    option(
+        press,
+        "--resolution MM",
+        "spacing of the map points and cell size of the lattice; default: 1",
+        float,
         default=1.0,
-        metavar="MM",
-        help="spacing of the map points and cell size of the lattice; default: 1",
     )
-    press.add_argument(
+    option(
+        press,
         "--bearing",
+        "fixation of the insert; default: fixed",
         choices=("fixed", "mobile"),
         default="fixed",
-        help="fixation of the insert; default: fixed",
     )
-    press.add_argument(
-        "--material",
+    option(
+        press,
+        "--material NAME|F.toml",
+        "name of a material, or a file with the keys of a scene's [material]; default: %(default)s",
         default="polyethylene",
-        metavar="NAME|F.toml",
-        help="name of a material, or a file with the keys of a scene's [material]; default: "
-        "%(default)s",
     )
     _add_side(press)
-    press.add_argument(
+    option(
+        press,
         "--adjust",
+        "before the press, move the femoral mesh until both condyles touch; default: no",
         action=argparse.BooleanOptionalAction,
         default=False,
-        help="before the press, move the femoral mesh until both condyles touch; default: no",
     )
-    press.add_argument(
+    option(
+        press,
         "--restore-when",
-        choices=("both", "either"),
-        help="with --adjust: the press is compared with the adjustment, in penetration and in "
+        "with --adjust: the press is compared with the adjustment, in penetration and in "
         "angle; the rotation of --pose is restored if both are larger than the adjustment's "
         "(both), or at least one of them (either); default: both",
+        choices=("both", "either"),
     )
-    press.add_argument(
-        "--out", type=Path, metavar="F.vtp", help="file for the pressure map, for ParaView"
-    )
+    option(press, "--out F.vtp", "file for the pressure map, for ParaView", Path)
     add_force(press)
-    press.add_argument("--json", action="store_true", help="print the result as JSON")
+    option(press, "--json", "print the result as JSON")
     press.set_defaults(command=_press)
 
 
@@ -127,27 +123,25 @@ def add_mesh(commands: Any) -> None:
     verbs = mesh.add_subparsers(required=True, metavar="VERB")
     check = verbs.add_parser("check", help="report holes, unit and axes of meshes")
     check.add_argument("files", type=Path, nargs="+", metavar="FILE", help="meshes")
-    check.add_argument("--json", action="store_true", help="print the findings as JSON")
+    option(check, "--json", "print the findings as JSON")
     check.set_defaults(command=_mesh_check)
     part = verbs.add_parser("part", help="write one of several bodies to a separate file")
     part.add_argument("file", type=Path, metavar="FILE", help="mesh of several bodies")
     part.add_argument(
         "number", type=int, metavar="N", help="number of the body in `tkamb mesh check`"
     )
-    part.add_argument("--out", type=Path, required=True, metavar="F", help=".stl, .ply or .obj")
+    option(part, "--out F", ".stl, .ply or .obj", Path, required=True)
     part.set_defaults(command=_mesh_part)
     lattice = verbs.add_parser(
         "lattice", help="make the lattice of an insert and report its quality"
     )
     lattice.add_argument("insert", type=Path, metavar="INSERT", help="mesh of the insert")
-    lattice.add_argument("--resolution", type=float, default=1.0, metavar="MM", help="cell size")
+    option(lattice, "--resolution MM", "cell size", float, default=1.0)
     _add_units(lattice, "unit of the mesh")
     _add_side(lattice)
-    lattice.add_argument(
-        "--out", type=Path, metavar="F.vtu", help="file for the lattice, for ParaView or meshio"
-    )
+    option(lattice, "--out F.vtu", "file for the lattice, for ParaView or meshio", Path)
     add_force(lattice)
-    lattice.add_argument("--json", action="store_true", help="print the report as JSON")
+    option(lattice, "--json", "print the report as JSON")
     lattice.set_defaults(command=_mesh_lattice)
 
 
@@ -226,19 +220,18 @@ def _add_side(command: argparse.ArgumentParser) -> None:
         metavar="ANT,SUP,RIGHT",
         help="mesh axes that point anterior, superior, right; write --axes=-x,+y,-z",
     )
-    command.add_argument(
+    option(
+        command,
         "--side",
+        "side of the knee; default: right",
         choices=("right", "left"),
         default="right",
-        help="side of the knee; default: right",
     )
 
 
 def add_no_cache(command: argparse.ArgumentParser) -> None:
     """Add --no-cache to a command."""
-    command.add_argument(
-        "--no-cache", action="store_true", help="do not use the cache of prepared operators on disk"
-    )
+    option(command, "--no-cache", "do not use the cache of prepared operators on disk")
 
 
 def without_cache(contact: str | None) -> dict[str, Any]:

@@ -6,7 +6,7 @@ rules by command. `tests/test_option_rules.py` checks that each option has an ef
 
 import argparse
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,46 +15,62 @@ from tkamb.errors import InputError
 from tkamb.io.toml_text import check_key, check_limits
 
 
+def option(
+    parser: Any, names: str, help: str, kind: Callable[[str], Any] | None = None, **more: Any
+) -> None:
+    """Add an option to a parser.
+
+    Args:
+        names: names of the option, and a word for its value: "--out DIR". Without this word,
+            `choices` and `action`, the option is a switch.
+        kind: function from the text of the value to the value; None: text.
+        more: further arguments of `argparse`.
+    """
+    words = names.split()
+    flags = [word for word in words if word.startswith("-")]
+    if len(words) > len(flags):
+        more["metavar"] = words[-1]
+    elif not more.keys() & {"choices", "action"}:
+        more["action"] = "store_true"
+    parser.add_argument(*flags, help=help, **more, **({} if kind is None else {"type": kind}))
+
+
 def add_scene_options(command: Any) -> None:
     """Add scene, --contact, --resolution, --out, --frames and --set to a command."""
     command.add_argument("scene", type=Path, help="scene.toml")
-    command.add_argument("--contact", metavar="NAME", help="contact model (`tkamb contact list`)")
-    command.add_argument("--resolution", type=float, metavar="MM", help="spacing of the map points")
-    command.add_argument("--out", type=Path, metavar="DIR", help="output folder")
-    command.add_argument(
-        "--frames", type=_frames, metavar="A:B:STEP", help="frames, as a slice in Python"
-    )
+    option(command, "--contact NAME", "contact model (`tkamb contact list`)")
+    option(command, "--resolution MM", "spacing of the map points", float)
+    option(command, "--out DIR", "output folder", Path)
+    option(command, "--frames A:B:STEP", "frames, as a slice in Python", _frames)
     add_set(command)
 
 
 def add_set(command: Any) -> None:
     """Add --set to a command."""
-    command.add_argument(
-        "--set",
+    option(
+        command,
+        "--set TABLE.KEY=VALUE",
+        "override a key of the scene; a list in brackets and quotes: "
+        "--set 'contact.released=[\"adduction\"]'",
+        _setting,
         action="append",
         default=[],
-        type=_setting,
-        metavar="TABLE.KEY=VALUE",
-        help="override a key of the scene; a list in brackets and quotes: "
-        "--set 'contact.released=[\"adduction\"]'",
     )
 
 
 def add_preset(command: Any) -> None:
     """Add --as to a command."""
-    command.add_argument(
-        "--as",
+    option(
+        command,
+        "--as NAME",
+        "apply a study's own choices to the scene: sharma-2008; --set still overrides them",
         dest="preset",
-        metavar="NAME",
-        help="apply a study's own choices to the scene: sharma-2008; --set still overrides them",
     )
 
 
 def add_force(command: argparse.ArgumentParser) -> None:
     """Add --force to a command whose --out is one file."""
-    command.add_argument(
-        "--force", action="store_true", help="--out may replace a file that tkamb did not write"
-    )
+    option(command, "--force", "--out may replace a file that tkamb did not write")
 
 
 def overrides_of(options: argparse.Namespace) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from tkamb.commands.options import option
 from tkamb.errors import InputError, TkambError
 from tkamb.run.guard import say
 from tkamb.units import MILLIMETRE
@@ -49,24 +50,21 @@ def add_compare(commands: Any) -> None:
         metavar="DIR",
         help="folders that `tkamb run` wrote, two or more",
     )
-    compare.add_argument(
+    option(
+        compare,
         "--axis",
+        "horizontal axis; default: the axis that all runs have",
         choices=("flexion", "cycle", "time"),
-        help="horizontal axis; default: the axis that all runs have",
     )
-    compare.add_argument(
-        "--frame",
-        type=int,
-        metavar="K",
-        help="frame of the first run to show maps of; default: the frame of the largest force",
+    option(
+        compare,
+        "--frame K",
+        "frame of the first run to show maps of; default: the frame of the largest force",
+        int,
     )
-    compare.add_argument(
-        "--out", type=Path, metavar="DIR", help=f"folder for {PAGE_NAME}; default out/compare"
-    )
-    compare.add_argument(
-        "--force", action="store_true", help="write into a folder that tkamb did not make"
-    )
-    compare.add_argument("--json", action="store_true", help="print the differences as JSON")
+    option(compare, "--out DIR", f"folder for {PAGE_NAME}; default out/compare", Path)
+    option(compare, "--force", "write into a folder that tkamb did not make")
+    option(compare, "--json", "print the differences as JSON")
     compare.set_defaults(command=_compare)
 
 
@@ -92,35 +90,24 @@ def add_export(commands: Any) -> None:
     export = commands.add_parser("export", help="write results for other programs")
     export.add_argument("folder", type=Path, metavar="DIR", help="folder that `tkamb run` wrote")
     kind = export.add_mutually_exclusive_group(required=True)
-    kind.add_argument("--sto", type=Path, metavar="F.sto", help="write all columns, for OpenSim")
-    kind.add_argument(
-        "--vtp",
-        action="store_true",
-        help="write pressure maps over time, for ParaView; needs --out",
-    )
-    kind.add_argument(
-        "--figures", action="store_true", help="write every plot as SVG, PDF and PNG; needs --out"
-    )
-    kind.add_argument(
+    option(kind, "--sto F.sto", "write all columns, for OpenSim", Path)
+    option(kind, "--vtp", "write pressure maps over time, for ParaView; needs --out")
+    option(kind, "--figures", "write every plot as SVG, PDF and PNG; needs --out")
+    option(
+        kind,
         "--deck",
+        "write the contact of one frame, for CalculiX or FEBio 4",
         choices=("ccx", "feb"),
-        help="write the contact of one frame, for CalculiX or FEBio 4",
     )
-    export.add_argument(
-        "--out",
-        type=Path,
-        metavar="DIR2",
-        help="folder for --vtp and --figures, or file for --deck (.inp, .feb)",
+    option(
+        export,
+        "--out DIR2",
+        "folder for --vtp and --figures, or file for --deck (.inp, .feb)",
+        Path,
     )
-    export.add_argument(
-        "--frame", type=int, metavar="K", help="for --deck: row of results.csv, from 0"
-    )
-    export.add_argument(
-        "--resolution", type=float, metavar="MM", help="for --deck: edge of the hexahedra"
-    )
-    export.add_argument(
-        "--force", action="store_true", help="--out may be a folder that tkamb did not make"
-    )
+    option(export, "--frame K", "for --deck: row of results.csv, from 0", int)
+    option(export, "--resolution MM", "for --deck: edge of the hexahedra", float)
+    option(export, "--force", "--out may be a folder that tkamb did not make")
     export.set_defaults(command=_export)
 
 
@@ -202,15 +189,13 @@ def add_folder_commands(commands: Any) -> None:
     verify.add_argument(
         "folder", type=Path, metavar="DIR", help="folder that `tkamb run` wrote, or its pack (.zip)"
     )
-    verify.add_argument(
-        "--inputs",
-        type=Path,
-        metavar="FOLDER",
-        help="folder with a copy of the scene and its files; default: that of the pack or the run",
+    option(
+        verify,
+        "--inputs FOLDER",
+        "folder with a copy of the scene and its files; default: that of the pack or the run",
+        Path,
     )
-    verify.add_argument(
-        "--rerun", action="store_true", help="compute the run again and compare all columns"
-    )
+    option(verify, "--rerun", "compute the run again and compare all columns")
     verify.set_defaults(command=_verify)
     report = commands.add_parser("report", help="write report.html of a folder of results again")
     report.add_argument("folder", type=Path, metavar="DIR", help="folder that `tkamb run` wrote")

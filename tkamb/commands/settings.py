@@ -13,6 +13,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from tkamb.commands.options import option
 from tkamb.errors import InputError
 from tkamb.settings import SUFFIX
 
@@ -103,7 +104,7 @@ def add_settings(commands: Any) -> None:
         description="Print the settings of every algorithm: name, value, unit and meaning.",
     )
     parser.add_argument("words", nargs="*", metavar="WORD", help="only settings with all words")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    option(parser, "--json", "print one JSON object")
     parser.set_defaults(command=_settings)
 
 

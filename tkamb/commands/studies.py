@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from tkamb.commands.options import option
 from tkamb.run.guard import say
 
 # Largest number of failed runs that are printed; the folder lists all. Ten lines
@@ -25,19 +26,13 @@ def add_cohort(commands: Any) -> None:
         metavar="FILE.toml",
         help="file of subjects, trials, designs and contact models",
     )
-    command.add_argument(
-        "--workers", type=int, default=1, metavar="N", help="number of processes; default 1"
-    )
-    command.add_argument("--dask", metavar="ADDRESS|local", help="compute on a Dask cluster")
-    command.add_argument(
-        "--shard", type=_part, metavar="I/N", help="every N-th run from the I-th, for a job queue"
-    )
-    command.add_argument("--frames", metavar="A:B:STEP", help="frames of every trial")
-    command.add_argument("--out", type=Path, metavar="DIR", help="output folder")
-    command.add_argument(
-        "--force", action="store_true", help="write into a folder that is not tkamb's"
-    )
-    command.add_argument("--resume", action="store_true", help="go on with an interrupted cohort")
+    option(command, "--workers N", "number of processes; default 1", int, default=1)
+    option(command, "--dask ADDRESS|local", "compute on a Dask cluster")
+    option(command, "--shard I/N", "every N-th run from the I-th, for a job queue", _part)
+    option(command, "--frames A:B:STEP", "frames of every trial")
+    option(command, "--out DIR", "output folder", Path)
+    option(command, "--force", "write into a folder that is not tkamb's")
+    option(command, "--resume", "go on with an interrupted cohort")
     command.set_defaults(command=_cohort)
 
 
@@ -103,22 +98,20 @@ def add_tradeoff(commands: Any) -> None:
         help="scene to measure in addition to tkamb's cases",
     )
     size = tradeoff.add_mutually_exclusive_group()
-    size.add_argument("--quick", action="store_true", help="two cases, 2 mm, within a minute")
-    size.add_argument("--full", action="store_true", help="every setting on every case")
-    tradeoff.add_argument("--peer", choices=("calculix",), help="compare with another program")
-    tradeoff.add_argument(
-        "--recompute", action="store_true", help="also compute the references again (slow)"
-    )
-    tradeoff.add_argument("--resume", action="store_true", help="go on with a stopped study")
-    tradeoff.add_argument(
-        "--out",
-        type=Path,
+    option(size, "--quick", "two cases, 2 mm, within a minute")
+    option(size, "--full", "every setting on every case")
+    option(tradeoff, "--peer", "compare with another program", choices=("calculix",))
+    option(tradeoff, "--recompute", "also compute the references again (slow)")
+    option(tradeoff, "--resume", "go on with a stopped study")
+    option(
+        tradeoff,
+        "--out DIR",
+        "output folder; default: %(default)s",
+        Path,
         default=Path("out/tradeoff"),
-        metavar="DIR",
-        help="output folder; default: %(default)s",
     )
-    tradeoff.add_argument("--force", action="store_true", help=NOT_OURS)
-    tradeoff.add_argument("--json", action="store_true", help="print the rows as JSON")
+    option(tradeoff, "--force", NOT_OURS)
+    option(tradeoff, "--json", "print the rows as JSON")
     tradeoff.set_defaults(command=_tradeoff)
 
 
@@ -193,20 +186,18 @@ def _study_tradeoff(options: argparse.Namespace, directory: Path) -> int:
 def add_stability(commands: Any) -> None:
     """Add `stability` to the command line."""
     stability = commands.add_parser("stability", help="test the contact models in extreme cases")
-    stability.add_argument("--quick", action="store_true", help="a tenth of the contact cases")
-    stability.add_argument("--resume", action="store_true", help="go on with a stopped study")
-    stability.add_argument(
-        "--workers", type=int, default=2, metavar="N", help="number of processes; default 2"
-    )
-    stability.add_argument(
-        "--out",
-        type=Path,
+    option(stability, "--quick", "a tenth of the contact cases")
+    option(stability, "--resume", "go on with a stopped study")
+    option(stability, "--workers N", "number of processes; default 2", int, default=2)
+    option(
+        stability,
+        "--out DIR",
+        "output folder; default: %(default)s",
+        Path,
         default=Path("out/stability"),
-        metavar="DIR",
-        help="output folder; default: %(default)s",
     )
-    stability.add_argument("--force", action="store_true", help=NOT_OURS)
-    stability.add_argument("--json", action="store_true", help="print the rows as JSON")
+    option(stability, "--force", NOT_OURS)
+    option(stability, "--json", "print the rows as JSON")
     stability.set_defaults(command=_stability)
 
 

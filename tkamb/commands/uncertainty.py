@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tkamb.commands.options import add_scene_options, overrides_of
+from tkamb.commands.options import add_scene_options, option, overrides_of
 from tkamb.run.guard import say
 
 if TYPE_CHECKING:
@@ -30,30 +30,14 @@ def add_uncertainty(commands: Any) -> None:
         "uncertainty", help="bands of all results of a scene from uncertain inputs"
     )
     add_scene_options(command)
-    command.add_argument(
-        "--samples", type=int, default=256, metavar="N", help="number of samples; default 256"
-    )
-    command.add_argument(
-        "--workers", type=int, default=1, metavar="N", help="number of processes; default 1"
-    )
-    command.add_argument("--dask", metavar="ADDRESS|local", help="compute on a Dask cluster")
-    command.add_argument(
-        "--method", default="lhs", metavar="lhs|sobol", help="sampling; default lhs"
-    )
-    command.add_argument(
-        "--indices",
-        action="store_true",
-        help="also Sobol' indices, with N (d + 2) samples of d inputs",
-    )
-    command.add_argument(
-        "--screen",
-        action="store_true",
-        help="vary one input at a time; takes seconds, writes nothing",
-    )
-    command.add_argument(
-        "--force", action="store_true", help="write into a folder that tkamb did not make"
-    )
-    command.add_argument("--resume", action="store_true", help="go on with an interrupted run")
+    option(command, "--samples N", "number of samples; default 256", int, default=256)
+    option(command, "--workers N", "number of processes; default 1", int, default=1)
+    option(command, "--dask ADDRESS|local", "compute on a Dask cluster")
+    option(command, "--method lhs|sobol", "sampling; default lhs", default="lhs")
+    option(command, "--indices", "also Sobol' indices, with N (d + 2) samples of d inputs")
+    option(command, "--screen", "vary one input at a time; takes seconds, writes nothing")
+    option(command, "--force", "write into a folder that tkamb did not make")
+    option(command, "--resume", "go on with an interrupted run")
     command.set_defaults(command=_uncertainty)
 
 

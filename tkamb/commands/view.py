@@ -5,6 +5,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from tkamb.commands.options import option
 from tkamb.errors import InputError
 from tkamb.io.claim import check_output_file
 from tkamb.run.guard import say
@@ -23,30 +24,22 @@ def add_view(commands: Any) -> None:
         metavar="SCENE|RESULTS",
         help="scene.toml or a folder that `tkamb run` wrote; several are shown side by side",
     )
-    view.add_argument(
-        "--contact",
+    option(
+        view,
+        "--contact NAME",
+        "contact model of a scene; several are shown side by side",
         action="append",
         default=[],
-        metavar="NAME",
-        help="contact model of a scene; several are shown side by side",
     )
-    view.add_argument("--frame", type=int, default=0, metavar="K", help="first frame that is shown")
-    view.add_argument("--camera", default="oblique", metavar="NAME", help=", ".join(CAMERAS))
-    view.add_argument("--lattice", action="store_true", help="draw the lattice, too")
-    view.add_argument(
-        "--html", type=Path, metavar="F", help="write one HTML file instead of a window"
-    )
-    view.add_argument("--png", type=Path, metavar="F", help="write a picture of the frame")
+    option(view, "--frame K", "first frame that is shown", int, default=0)
+    option(view, "--camera NAME", ", ".join(CAMERAS), default="oblique")
+    option(view, "--lattice", "draw the lattice, too")
+    option(view, "--html F", "write one HTML file instead of a window", Path)
+    option(view, "--png F", "write a picture of the frame", Path)
     for kind in ("gif", "mp4"):
-        view.add_argument(
-            f"--{kind}", type=Path, metavar="F", help="write all frames as a film (extra: film)"
-        )
-    view.add_argument(
-        "--force", action="store_true", help="write over files that tkamb did not write"
-    )
-    view.add_argument(
-        "--port", type=int, default=0, help="port of the window; default: any free port"
-    )
+        option(view, f"--{kind} F", "write all frames as a film (extra: film)", Path)
+    option(view, "--force", "write over files that tkamb did not write")
+    option(view, "--port PORT", "port of the window; default: any free port", int, default=0)
     view.set_defaults(command=_view)
 
 
@@ -138,16 +131,10 @@ def add_live(commands: Any) -> None:
         metavar="SCENE|RESULTS",
         help="scene.toml or a folder that `tkamb run` wrote",
     )
-    live.add_argument(
-        "--frame", type=int, default=0, metavar="K", help="first recorded frame that is shown"
-    )
-    live.add_argument("--contact", metavar="NAME", help="contact model, instead of the scene's")
-    live.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder for saved scenes; default: out/live"
-    )
-    live.add_argument(
-        "--port", type=int, default=0, help="port of the window; default: any free port"
-    )
+    option(live, "--frame K", "first recorded frame that is shown", int, default=0)
+    option(live, "--contact NAME", "contact model, instead of the scene's")
+    option(live, "--out DIR", "folder for saved scenes; default: out/live", Path)
+    option(live, "--port PORT", "port of the window; default: any free port", int, default=0)
     live.set_defaults(command=_live)
 
 

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tkamb.commands.options import add_set
+from tkamb.commands.options import add_set, option
 from tkamb.errors import InputError
 from tkamb.run.guard import say
 
@@ -22,84 +22,54 @@ def add_wear(commands: Any) -> None:
     wear.add_argument(
         "case", type=Path, metavar="SCENE|DIR", help="scene.toml, or a folder that `run` wrote"
     )
-    wear.add_argument(
-        "--simulator",
-        type=Path,
-        metavar="PROFILE",
-        help="CSV with load and displacements or forces over per cent of the cycle, "
+    option(
+        wear,
+        "--simulator PROFILE",
+        "CSV with load and displacements or forces over per cent of the cycle, "
         "instead of the scene's motion",
+        Path,
     )
-    wear.add_argument(
-        "--springs",
-        type=Path,
-        metavar="F",
-        help="springs of the simulator (.toml), for force control",
+    option(wear, "--springs F", "springs of the simulator (.toml), for force control", Path)
+    option(wear, "--cycles N", f"number of cycles; default {CYCLES:.0e}", _count, default=CYCLES)
+    option(
+        wear, "--updates M", "number of updates of the geometry; default 10", int, default=UPDATES
     )
-    wear.add_argument(
-        "--cycles",
-        type=_count,
-        default=CYCLES,
-        metavar="N",
-        help=f"number of cycles; default {CYCLES:.0e}",
+    option(wear, "--law NAME", "wear law; default: the material's own")
+    option(
+        wear,
+        "--material NAME|F",
+        "wear material, or a material file (.toml); default: conventional",
     )
-    wear.add_argument(
-        "--updates",
-        type=int,
-        default=UPDATES,
-        metavar="M",
-        help="number of updates of the geometry; default 10",
-    )
-    wear.add_argument("--law", metavar="NAME", help="wear law; default: the material's own")
-    wear.add_argument(
-        "--material",
-        metavar="NAME|F",
-        help="wear material, or a material file (.toml); default: conventional",
-    )
-    wear.add_argument(
-        "--close",
-        metavar="HOW",
-        help="closing of a recording to a cycle: interpolate (from the last frame to the first; "
+    option(
+        wear,
+        "--close HOW",
+        "closing of a recording to a cycle: interpolate (from the last frame to the first; "
         "default), there-and-back, or 'as recorded'",
     )
-    wear.add_argument(
-        "--wear-factor",
-        type=float,
-        metavar="K",
-        help="wear factor, mm3/(N m), instead of the material's",
-    )
-    wear.add_argument("--contact", metavar="NAME", help="contact model, instead of the scene's")
-    wear.add_argument("--resolution", type=float, metavar="MM", help="spacing of the map points")
-    wear.add_argument(
-        "--frames-per-cycle",
-        type=int,
-        default=FRAMES,
-        metavar="N",
-        help="of a recording: largest number of frames, first and last included; of a simulator's "
+    option(wear, "--wear-factor K", "wear factor, mm3/(N m), instead of the material's", float)
+    option(wear, "--contact NAME", "contact model, instead of the scene's")
+    option(wear, "--resolution MM", "spacing of the map points", float)
+    option(
+        wear,
+        "--frames-per-cycle N",
+        "of a recording: largest number of frames, first and last included; of a simulator's "
         "profile: smallest number of rows; default 40",
+        int,
+        default=FRAMES,
     )
-    wear.add_argument(
-        "--period",
-        type=float,
-        default=1.0,
-        metavar="S",
-        help="period of a simulator's cycle, s, for creep",
-    )
-    wear.add_argument(
-        "--samples",
-        type=int,
-        metavar="N",
-        help="samples for bands; default: 32 if the scene has [uncertainty], else 0",
+    option(wear, "--period S", "period of a simulator's cycle, s, for creep", float, default=1.0)
+    option(
+        wear,
+        "--samples N",
+        "samples for bands; default: 32 if the scene has [uncertainty], else 0",
+        int,
     )
     add_set(wear)
-    wear.add_argument(
-        "--workers", type=int, default=1, metavar="N", help="number of processes for the samples"
-    )
-    wear.add_argument("--out", type=Path, metavar="DIR", help="output folder")
-    wear.add_argument(
-        "--force", action="store_true", help="write into a folder that tkamb did not make"
-    )
-    wear.add_argument("--resume", action="store_true", help="go on with an interrupted simulation")
-    wear.add_argument("--json", action="store_true", help="print wear.json")
+    option(wear, "--workers N", "number of processes for the samples", int, default=1)
+    option(wear, "--out DIR", "output folder", Path)
+    option(wear, "--force", "write into a folder that tkamb did not make")
+    option(wear, "--resume", "go on with an interrupted simulation")
+    option(wear, "--json", "print wear.json")
     wear.set_defaults(command=_wear)
 
 
