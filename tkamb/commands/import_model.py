@@ -316,11 +316,7 @@ def _write_registration(patient: "ImportedPatient", path: Path) -> None:
 
 
 def import_request(options: argparse.Namespace) -> "ImportRequest":
-    """Return the request of a command line.
-
-    Raises:
-        InputError: options exclude each other, or a number is out of range.
-    """
+    """Return the request of a command line."""
     from tkamb.io.importing.scene_text import ImportRequest
     from tkamb.io.recordings.laboratory import GivenUnits
 

@@ -230,11 +230,7 @@ RULES: dict[str, tuple[Rule, ...]] = {
 def check_options(
     parser: argparse.ArgumentParser, arguments: Sequence[str], options: argparse.Namespace
 ) -> None:
-    """Raise if an option has no effect because of the other options.
-
-    Raises:
-        InputError: an option has no effect; the message names what it needs or excludes.
-    """
+    """Raise if an option has no effect because of the other options."""
     command, leaf, remaining = command_of(parser, arguments)
     present = _option_names(leaf, remaining)
     for rule in RULES.get(command, ()):

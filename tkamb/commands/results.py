@@ -19,12 +19,7 @@ _NAMES = ("folder", "folders", "runs", "path", "case")
 
 @contextmanager
 def reading_results(options: argparse.Namespace) -> Iterator[None]:
-    """Name the folders of results in the error of a command that cannot use their content.
-
-    Raises:
-        InputError: the command reads a folder of results, and content of another kind than this
-            version writes stops it.
-    """
+    """Name the folders of results in the error of a command that cannot use their content."""
     try:
         yield
     except (TkambError, OSError, MemoryError):

@@ -112,10 +112,6 @@ def claimed_directory(path: str | Path, force: bool = False, command: str = "") 
         force: whether the folder may hold foreign files, which stay unchanged, or another command's
             output.
         command: tkamb command that writes into the folder; "": any command's output is allowed.
-
-    Raises:
-        InputError: the folder cannot be made or written, holds foreign files or another command's
-            output, or is locked by another process; or an error of the block.
     """
     path = Path(path)
     new_folders = [folder for folder in (path, *path.parents) if not _exists(folder)]
@@ -148,11 +144,7 @@ def claimed_directory(path: str | Path, force: bool = False, command: str = "") 
 
 
 def settle(folder: Path) -> None:
-    """Complete a killed process's file changes in a folder of tkamb's.
-
-    Raises:
-        InputError: the changes cannot be completed.
-    """
+    """Complete a killed process's file changes in a folder of tkamb's."""
     if replacement_pending(folder):
         with claimed_directory(folder):
             pass
@@ -223,9 +215,6 @@ def check_output_file(path: str | Path | None, force: bool = False) -> None:
     Args:
         path: the output file; None: no file is written.
         force: whether any file may be replaced.
-
-    Raises:
-        InputError: the path is not a file, or holds a file that tkamb did not write.
     """
     if path is None or not os.path.lexists(path):
         return

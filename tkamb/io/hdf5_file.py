@@ -71,9 +71,6 @@ def new_hdf5(path: Path) -> Iterator[Any]:
 
     Args:
         path: path of a temporary file; after a failure its content is incomplete.
-
-    Raises:
-        InputError: the file cannot be opened or written.
     """
     try:
         stream = NotingFile(path)

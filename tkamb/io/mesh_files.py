@@ -40,11 +40,7 @@ TYPES = {"f8": "Float64", "i8": "Int64", "u1": "UInt8", "i1": "Int8"}
 
 
 def write_lattice(lattice: Lattice, path: str | Path) -> None:
-    """Write the cells of a lattice, its node classes and scaled Jacobians as .vtu, in metres.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write the cells of a lattice, its node classes and scaled Jacobians as .vtu, in metres."""
     write_hexahedra(
         path,
         lattice.nodes,
@@ -93,9 +89,6 @@ def write_map_series(maps: "ContactMaps", folder: Path) -> list[str]:
 
     Returns:
         The names of the files, the .pvd first.
-
-    Raises:
-        InputError: no frame has a map, or the folder cannot be written.
     """
     mapped_frames = np.flatnonzero(np.isfinite(maps.peaks_Pa))
     if not len(mapped_frames):
@@ -199,9 +192,6 @@ def lattice_of_file(
         axes: axes of the mesh that point anterior, superior and right.
         side: side of the knee; a left insert is mirrored.
         out: path of the .vtu file, in metres and in the insert frame; None: no file is written.
-
-    Raises:
-        InputError: file, unit, axes, side or resolution cannot be used, or the mesh is open.
     """
     if out is not None and Path(out).suffix != ".vtu":
         raise InputError(f"'{out}' is not a .vtu file", "out", "give a name like lattice.vtu")
@@ -232,10 +222,6 @@ def write_body(path: str | Path, number: int, out: str | Path) -> str:
 
     Returns:
         One line on the written body.
-
-    Raises:
-        InputError: the mesh cannot be read or has no such body, or `out` exists, has another
-            format, or cannot be written.
     """
     out = Path(out)
     if out.suffix.lower() not in BODY_FORMATS:

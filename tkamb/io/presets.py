@@ -117,9 +117,6 @@ class Preset:
 
         Args:
             overrides: dotted key -> value that replaces the preset's value later.
-
-        Raises:
-            InputError: the scene lacks data that the study needs.
         """
         self._check_needs(content, where)
         other_model = overrides.get(MODEL, self.settings.get(MODEL)) != self.settings.get(MODEL)
@@ -257,9 +254,5 @@ PRESETS = NamedClasses("preset", Preset, "tkamb.io.presets", BUILT_IN)
 
 
 def find_preset(name: str) -> Preset:
-    """Return the preset with a name.
-
-    Raises:
-        InputError: no preset or several presets have the name, or its class cannot be imported.
-    """
+    """Return the preset with a name."""
     return PRESETS.find(name)()

@@ -47,20 +47,12 @@ _DIGITS = re.compile(rf"[0-9_]{{{LIMITS.digits + 1},}}|0[xob][0-9a-fA-F_]{{{LIMI
 
 
 def read_toml(path: str | Path, *, what: str) -> dict[str, Any]:
-    """Return the content of a TOML file.
-
-    Raises:
-        InputError: the file cannot be read, is not TOML, or exceeds `TomlLimits`.
-    """
+    """Return the content of a TOML file."""
     return parse_toml(read_text(path, LIMITS.size, what=what), path)
 
 
 def parse_toml(text: str, where: object) -> dict[str, Any]:
-    """Return the content of TOML text.
-
-    Raises:
-        InputError: the text is not TOML, or exceeds `TomlLimits`.
-    """
+    """Return the content of TOML text."""
     check_limits(text, where)
     try:
         return tomllib.loads(text.removeprefix("\ufeff"))  # a byte order mark of an editor

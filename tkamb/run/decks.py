@@ -83,11 +83,7 @@ class Deck:
 
     @property
     def text(self) -> str:
-        """The deck in mm, N and MPa.
-
-        Raises:
-            InputError: the deck does not support the material's law or the bearing.
-        """
+        """The deck in mm, N and MPa."""
         if self.bearing != "fixed":
             raise InputError("can only fix the whole bottom of the insert", "CalculiX's deck")
         lattice, patch, n = self.lattice, self.patch, len(self.lattice.nodes)
@@ -136,9 +132,6 @@ def febio_text(problem: "PressProblem", approach: float, comments: Iterable[str]
 
     Args:
         approach: displacement of the femoral component along -y from first touch, m.
-
-    Raises:
-        InputError: a bearing that is not fixed, or a material that is not linear.
     """
     pair, lattice, patch = problem.pair, problem.lattice, problem.patch
     if pair.bearing != "fixed":
@@ -293,11 +286,7 @@ class FramePress:
         )
 
     def deck(self, kind: str) -> str:
-        """Return the deck of CalculiX ("ccx") or FEBio ("feb").
-
-        Raises:
-            InputError: the deck does not support the material or the bearing.
-        """
+        """Return the deck of CalculiX ("ccx") or FEBio ("feb")."""
         problem, text = self.problem, self.comments()
         if kind == "feb":
             return febio_text(

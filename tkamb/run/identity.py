@@ -38,11 +38,7 @@ SUFFIXES = (".py", ".so", ".pyd")
 
 
 def contact_code(model: str) -> str | None:
-    """Return the SHA-256 of the package of a contact model; None for a built-in model.
-
-    Raises:
-        InputError: no such model, or it cannot be loaded.
-    """
+    """Return the SHA-256 of the package of a contact model; None for a built-in model."""
     from tkamb.contact.registry import BUILT_IN, contact_class  # only where contact is modelled
 
     return None if model in BUILT_IN else package_code(contact_class(model).__module__)
@@ -188,11 +184,7 @@ RUN_AGAIN = "run it again: tkamb run"
 
 
 def case_of_results(results: "Results") -> "Case":
-    """Return the case of a results folder, read from the scene that its summary names.
-
-    Raises:
-        InputError: the scene is missing, or scene or files have changed since the run.
-    """
+    """Return the case of a results folder, read from the scene that its summary names."""
     from tkamb.io.scene.case import load_case
 
     summary = results.summary

@@ -54,9 +54,6 @@ class MapWriter:
         points: map points in the insert frame, m, (n, 3).
         triangles: indices into the points, (k, 3).
         attributes: texts and numbers, such as frame, model, version and scene hash.
-
-    Raises:
-        InputError: the file cannot be written.
     """
 
     def __init__(
@@ -144,11 +141,7 @@ class MapWriter:
             self.flush()
 
     def flush(self) -> None:
-        """Write the appended frames, their times last.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
+        """Write the appended frames, their times last."""
         if not self._waiting:
             return
         begin, end = self._written_frames, len(self)
@@ -389,11 +382,7 @@ class ContactMaps:
 
 
 def read_maps(path: str | Path) -> ContactMaps:
-    """Open a contact.h5 of a finished or killed run.
-
-    Raises:
-        InputError: no such file, or not an HDF5 file.
-    """
+    """Open a contact.h5 of a finished or killed run."""
     maps = ContactMaps(Path(path))
     check_file(path, float("inf"), what="contact.h5")
     len(maps)  # opens the file
@@ -401,11 +390,7 @@ def read_maps(path: str | Path) -> ContactMaps:
 
 
 def write_maps(maps: ContactMaps, path: Path) -> None:
-    """Write maps from memory as a complete contact.h5.
-
-    Raises:
-        InputError: the folder cannot be written.
-    """
+    """Write maps from memory as a complete contact.h5."""
     points, triangles, attributes = maps.points_m, maps.triangles, maps.attributes
     with (
         replaced_file(path) as temporary,

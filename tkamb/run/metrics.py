@@ -42,11 +42,7 @@ class Peak:
 
 
 def body_weight(results: "Results") -> float:
-    """Return body weight, N: mass x 9.80665 m/s².
-
-    Raises:
-        InputError: the summary has no body mass.
-    """
+    """Return body weight, N: mass x 9.80665 m/s²."""
     mass = results.summary.get("body_mass_kg")
     if not mass:
         raise InputError("has no 'body_mass_kg'", "summary", "forces in BW need it")

@@ -120,9 +120,6 @@ class PressReport:
         """Write the pressure map as .vtp: metres, insert frame, z to the subject's right.
 
         The map of a left knee is mirrored back to the side of the given meshes.
-
-        Raises:
-            InputError: the format is another one, or the file cannot be written.
         """
         from tkamb.io.mesh_files import write_triangles
 
@@ -435,9 +432,6 @@ def mesh_pose(pose: Sequence[float] | None, units: str, rotation: Array) -> Arra
         pose: x, y, z (units), rx, ry, rz (deg, intrinsic x-y-z) in mesh axes; None: identity.
         units: unit of length.
         rotation: rotation from mesh to anatomical axes, (3, 3).
-
-    Raises:
-        InputError: not six finite numbers.
     """
     if pose is None:
         return np.eye(4)
@@ -451,11 +445,7 @@ def mesh_pose(pose: Sequence[float] | None, units: str, rotation: Array) -> Arra
 
 
 def read_pose(path: str | Path) -> tuple[float, ...]:
-    """Read x y z rx ry rz from a text file with blanks, commas or line breaks between them.
-
-    Raises:
-        InputError: no such file, or not six numbers.
-    """
+    """Read x y z rx ry rz from a text file with blanks, commas or line breaks between them."""
     try:
         words = read_text(path, what="pose file").replace(",", " ").split()
         values = tuple(float(word) for word in words)

@@ -91,9 +91,6 @@ class Shards:
         resume: whether to continue an earlier run with the same identity. Otherwise its frames are
             removed when the first frame is written.
         name: name of the folder of the frames in the output folder.
-
-    Raises:
-        InputError: the earlier run has another identity, or the folder is a symbolic link.
     """
 
     def __init__(
@@ -110,11 +107,7 @@ class Shards:
             self.resumed = True
 
     def begin(self) -> None:
-        """Create the folder with the identity, once.
-
-        Raises:
-            InputError: the folder cannot be written.
-        """
+        """Create the folder with the identity, once."""
         if self._is_ready:
             return
         if not self.resumed:
@@ -138,11 +131,7 @@ class Shards:
             temporary.write_bytes(self._digest(frame, content) + content)
 
     def get(self, frame: int) -> Shard | None:
-        """Return a frame; None: it is absent, incomplete or of another run.
-
-        Raises:
-            InputError: the frame has the right SHA-256, but cannot be read.
-        """
+        """Return a frame; None: it is absent, incomplete or of another run."""
         path = self._path(frame)
         try:
             packed = read_bytes(path, LARGEST)
@@ -156,11 +145,7 @@ class Shards:
             return Shard(dict(json.loads(arrays.pop("row").tobytes())), arrays or None)
 
     def read(self, frame: int, make: Callable[[Shard], T]) -> T | None:
-        """Return what `make` returns for a frame; None: as `get`.
-
-        Raises:
-            InputError: the frame has the right SHA-256, but `make` cannot use it.
-        """
+        """Return what `make` returns for a frame; None: as `get`."""
         shard = self.get(frame)
         with undamaged(self._path(frame), FORGET_FRAME):
             return None if shard is None else make(shard)
@@ -300,9 +285,6 @@ class FolderRecorder(Recorder):
     Args:
         directory: folder that this process has claimed (`tkamb.io.claim`).
         resume: whether to continue an earlier run in the folder.
-
-    Raises:
-        InputError: the earlier run has another identity, or the folder cannot be written.
     """
 
     def __init__(self, directory: Path, identity: Mapping[str, Any], resume: bool) -> None:
@@ -399,11 +381,7 @@ def interrupt_later() -> Iterator[None]:
 
 
 def finished_results(directory: Path, identity: Mapping[str, Any]) -> "Results | None":
-    """Return the complete results of a run in a folder; None: none, or not all frames.
-
-    Raises:
-        InputError: the results are of another run, or have changed since they were written.
-    """
+    """Return the complete results of a run in a folder; None: none, or not all frames."""
     settle(directory)
     if not os.path.exists(directory / SUMMARY_NAME):
         return None

@@ -79,9 +79,6 @@ def verify_results(directory: str | Path, inputs: str | Path | None = None) -> V
     Args:
         inputs: folder with copies of scene and inputs, at any depth. Default: the folder `inputs`
             of a pack, if there is one, else the folder of the run.
-
-    Raises:
-        InputError: it is not a results folder, or `inputs` has no copy of the scene.
     """
     directory = Path(directory)
     check_replaced(directory)
@@ -137,11 +134,7 @@ def _plug_in_note(model: str, code: str) -> list[str]:
 
 
 def scene_name(summary: Mapping[str, Any]) -> str:
-    """Return the file name of the scene of a run.
-
-    Raises:
-        InputError: the scene of the run was no file.
-    """
+    """Return the file name of the scene of a run."""
     if not summary.get("scene"):
         hint = "write the scene to a file and run it again"
         raise InputError("names no scene file", SUMMARY_NAME, hint)
@@ -155,9 +148,6 @@ def inputs_folder(
 
     Args:
         given: folder in which to look for a copy of the scene.
-
-    Raises:
-        InputError: `given` is no folder, or has no copy of the scene.
     """
     packed = directory / INPUTS_NAME
     root = packed if given is None and packed.is_dir() else given
@@ -212,9 +202,6 @@ def rerun(directory: str | Path, inputs: str | Path | None = None) -> Rerun:
 
     Args:
         inputs: as in `verify_results`.
-
-    Raises:
-        InputError: the folder is damaged, or scene or inputs are missing or cannot be used.
     """
     from tkamb.io.scene import load_scene
     from tkamb.run.simulation import simulate
@@ -263,10 +250,6 @@ def pack(directory: str | Path, archive: str | Path) -> int:
 
     Returns:
         Number of input files.
-
-    Raises:
-        InputError: the folder is no results folder, an input has changed or is missing, the scene
-            names an absolute path, or the archive is no .zip or cannot be written.
     """
     directory, archive = Path(directory), Path(archive)
     if archive.suffix.lower() != ".zip":
@@ -315,11 +298,7 @@ The licence of the inputs is that of their owners.
 
 @contextmanager
 def unpacked(path: str | Path) -> Iterator[Path]:
-    """Provide the results folder of a path: the folder itself, or the content of a pack.
-
-    Raises:
-        InputError: the archive cannot be read.
-    """
+    """Provide the results folder of a path: the folder itself, or the content of a pack."""
     path = Path(path)
     if path.suffix.lower() != ".zip" or path.is_dir():
         yield path

@@ -77,11 +77,7 @@ class Results:
         return f"<tkamb.Results: {', '.join(parts)}>"
 
     def __getitem__(self, name: str) -> Array:
-        """Return a numeric column (f,).
-
-        Raises:
-            InputError: no such column; the message lists the nearest names.
-        """
+        """Return a numeric column (f,)."""
         if name not in self.columns:
             raise InputError(f"no column '{name}'", "results", names_near(name, self.columns))
         return self.columns[name]
@@ -158,11 +154,7 @@ def _complete_columns(given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_csv(path: str | Path) -> dict[str, Any]:
-    """Read the columns of a results.csv of this or an earlier release.
-
-    Raises:
-        InputError: no such file, an unknown column, a row of another length, or a bad number.
-    """
+    """Read the columns of a results.csv of this or an earlier release."""
     columns = _read_columns(Path(path))
     for name in columns:
         if name not in KINDS and not in_a_family(name):
@@ -171,11 +163,7 @@ def read_csv(path: str | Path) -> dict[str, Any]:
 
 
 def read_bands(path: str | Path) -> dict[str, Array]:
-    """Read the columns of a bands.csv.
-
-    Raises:
-        InputError: no such file, a row of another length, or a bad number.
-    """
+    """Read the columns of a bands.csv."""
     return _read_columns(Path(path))
 
 

@@ -94,11 +94,7 @@ def _read_maps(path: Path, frames: int) -> "ContactMaps | None":
 
 
 def read_summary(directory: Path) -> dict[str, Any]:
-    """Return the content of a folder's summary.json.
-
-    Raises:
-        InputError: no such file, not a JSON object, or a value that tkamb does not write.
-    """
+    """Return the content of a folder's summary.json."""
     path = directory / SUMMARY_NAME
     summary = read_json(path, SUMMARY_LIMIT, what="summary of a run")
     if not isinstance(summary, dict):
@@ -145,9 +141,6 @@ def write_results(
         more: name in `UNCERTAINTY_NAMES` -> function that writes the file at a path. Other files of
             these names are removed.
         report: function that returns the page report.html; None: the folder has no report.
-
-    Raises:
-        InputError: the folder cannot be claimed (`tkamb.io.claim`) or written.
     """
     if BANDS_NAME not in (more or {}):
         results = replace(results, bands={})  # the report must not show bands without their file

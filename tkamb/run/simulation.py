@@ -391,11 +391,7 @@ def _case_with_contact(scene: Scene | Case, model: str | None, resolution_mm: fl
 
 
 def chosen_frames(frames: slice | range | None, count: int) -> range:
-    """Return the frames of a slice or range.
-
-    Raises:
-        InputError: an end lies outside the motion, or there are no frames.
-    """
+    """Return the frames of a slice or range."""
     must_be(frames, (slice, range, NoneType), "frames", "give a slice or a range")
     if frames is None:
         return range(count)

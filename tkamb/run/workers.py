@@ -153,9 +153,6 @@ class PoolOptions:
         workers: number of worker processes; 1: the jobs are computed in this process.
         dask: address of a Dask scheduler; None or "local": the worker processes. They have no
             scheduler, and no port that others could reach.
-
-    Raises:
-        InputError: too few or too many workers.
     """
 
     workers: int = 1

@@ -88,9 +88,6 @@ def horizontal_axis(results: "Results", kind: str | None = None) -> HorizontalAx
 
     A cycle axis uses the column `cycle_percent`. Without this column, 0 and 100 % are the times
     `cycle_percent_s` of the summary, or the ends of the motion.
-
-    Raises:
-        InputError: the kind does not exist.
     """
     kind = kind or results.summary.get("axis") or "flexion"
     if kind == "flexion":

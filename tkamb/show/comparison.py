@@ -203,10 +203,6 @@ def compare_folders(folders: Sequence[str | Path], axis: str | None = None) -> C
 
     Args:
         axis: "flexion", "cycle" or "time"; default: the axis of all the runs.
-
-    Raises:
-        InputError: there are fewer than two or too many folders, a folder has no results, or the
-            runs have different axes.
     """
     if not 2 <= len(folders) <= MAX_RUNS:
         what = f"needs two to {MAX_RUNS} folders of results, not {len(folders)}"

@@ -221,11 +221,7 @@ def headline(comparison: Comparison) -> list[Difference]:
 
 
 def check_frame(comparison: Comparison, frame: int | None) -> int:
-    """Return the frame of the first run at which maps are shown; negative ones count from the end.
-
-    Raises:
-        InputError: the first run has no such frame.
-    """
+    """Return the frame of the first run at which maps are shown; negative ones count from the end."""
     count = len(comparison.runs[0].results)
     if frame is None:
         return shown_frame(comparison)
@@ -236,11 +232,7 @@ def check_frame(comparison: Comparison, frame: int | None) -> int:
 
 
 def comparison_html(comparison: Comparison, frame: int | None = None) -> str:
-    """Return the page: curves, maps at a frame, differences and notes.
-
-    Raises:
-        InputError: the first run has no such frame.
-    """
+    """Return the page: curves, maps at a frame, differences and notes."""
     frame = check_frame(comparison, frame)
     style = asset("tkamb.show", "report.css") + asset("tkamb.show", "compare.css")
     maps = draw_maps(comparison, frame)

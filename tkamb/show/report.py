@@ -74,11 +74,7 @@ PROVENANCE = (
 
 
 def write_report(results: "Results", path: str | Path) -> None:
-    """Write the report of a run as one self-contained HTML page.
-
-    Raises:
-        InputError: the folder cannot be written, or the summary lacks the body mass.
-    """
+    """Write the report of a run as one self-contained HTML page."""
     write_text(Path(path), report_html(results))
 
 

@@ -310,9 +310,6 @@ def check_scene(
     Args:
         overrides: dotted scene key -> value, see `tkamb.load_scene`.
         begin: function that is called with the name of each stage.
-
-    Raises:
-        InputError: the scene or one of its files is invalid.
     """
     begin("reading the scene and its files")
     scene = load_scene(path, overrides)

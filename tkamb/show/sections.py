@@ -247,9 +247,6 @@ def wear_section(results: "Results") -> dict[str, Any] | None:
     """Return the content of the section on wear; None: the folder has no wear.json.
 
     If wear.json belongs to another scene or other frames, the section states only this.
-
-    Raises:
-        InputError: wear.json or its picture cannot be read.
     """
     result, folder = wear_of_run(results), results.directory
     if result is None or folder is None:
@@ -298,9 +295,6 @@ def wear_of_run(results: "Results") -> dict[str, Any] | None:
     The result is empty if wear.json belongs to another scene, other files or other frames. If the
     wear was computed from the whole motion or from a simulator's cycle, the frames of the run are
     not compared.
-
-    Raises:
-        InputError: wear.json cannot be read.
     """
     folder = results.directory
     if folder is None or not (folder / WEAR_NAME).is_file():

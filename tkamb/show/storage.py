@@ -34,10 +34,6 @@ def write_storage(path: Path, columns: Mapping[str, Array], in_degrees: bool) ->
     Args:
         columns: name -> (n,) values. The first is "time", s.
         in_degrees: whether the header states degrees.
-
-    Raises:
-        InputError: "time" is not first, lengths differ, a name has a blank, or the file cannot be
-            written.
     """
     names = list(columns)
     lengths = {len(values) for values in columns.values()}
@@ -68,10 +64,6 @@ def write_results_storage(results: "Results", path: Path) -> str:
 
     Returns:
         A line of text with the numbers of frames and columns.
-
-    Raises:
-        InputError: the suffix is another one, the file exists, times do not increase, or the file
-            cannot be written.
     """
     if path.suffix.lower() not in STORAGE:
         raise InputError(f"does not end in {' or '.join(STORAGE)}", path, "rename the file")

@@ -69,11 +69,7 @@ class PeerRun:
 
 
 def find_program() -> str:
-    """Return the path of the CalculiX program.
-
-    Raises:
-        InputError: CalculiX is not installed.
-    """
+    """Return the path of the CalculiX program."""
     result = shutil.which(PROGRAM)
     if result is None:
         raise InputError("is not installed", "CalculiX", "apt-get install calculix-ccx")

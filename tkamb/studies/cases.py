@@ -205,11 +205,7 @@ def case_names(scene: Path | None = None) -> tuple[str, ...]:
 
 
 def study_case(name: str, scene: Path | None = None) -> StudyCase:
-    """Return the case with a given name; `scene` is a user's scene file.
-
-    Raises:
-        InputError: no case has this name.
-    """
+    """Return the case with a given name; `scene` is a user's scene file."""
     if name in _ANALYTIC:
         return _ANALYTIC[name](name)
     if name not in case_names(scene):

@@ -29,9 +29,6 @@ class KeptRows:
     Args:
         resume: whether to use the rows of an earlier study in the folder. Otherwise they are
             deleted.
-
-    Raises:
-        InputError: the folder cannot be written.
     """
 
     def __init__(self, directory: Path, resume: bool) -> None:

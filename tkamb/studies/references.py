@@ -286,11 +286,7 @@ def _by_layer(case: StudyCase, sphere: Sphere) -> tuple[Quantities, Quantities]:
 
 
 def read_references(path: Path = STORED) -> dict[str, Reference]:
-    """Return case name -> reference of a file; empty if the file does not exist.
-
-    Raises:
-        InputError: the file has other content.
-    """
+    """Return case name -> reference of a file; empty if the file does not exist."""
     if not path.exists():
         return {}
     try:
@@ -313,11 +309,7 @@ def write_references(references: dict[str, Reference], path: Path) -> None:
 
 
 def reference_of(case: StudyCase, stored: dict[str, Reference]) -> Reference:
-    """Return the stored reference of a case.
-
-    Raises:
-        InputError: the reference is missing, or belongs to an earlier version of the case.
-    """
+    """Return the stored reference of a case."""
     result = stored.get(case.name)
     if result is None or result.hash != case.hash:
         word = "is missing" if result is None else "belongs to an earlier version of the case"

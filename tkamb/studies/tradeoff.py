@@ -163,11 +163,7 @@ def as_json(rows: Sequence[Row]) -> str:
 
 
 def read_rows(path: Path) -> list[Row]:
-    """Return the rows of a tradeoff.json.
-
-    Raises:
-        InputError: the file is missing or has other content.
-    """
+    """Return the rows of a tradeoff.json."""
     try:
         return [row_of(content) for content in json.loads(path.read_text(encoding="utf-8"))]
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -298,9 +294,6 @@ def run_peer(
         references: case name -> reference.
         rows: stored measures of earlier studies. They are not repeated; new ones are added.
         sizes_mm: requested cell sizes, mm.
-
-    Raises:
-        InputError: CalculiX is not installed.
     """
     find_program()
     for case in cases:
@@ -522,11 +515,7 @@ def body_table(rows: Sequence[BodyRow]) -> list[str]:
 
 
 def read_body_rows(path: Path) -> list[BodyRow]:
-    """Return the rows of a body.json.
-
-    Raises:
-        InputError: the file is missing or has other content.
-    """
+    """Return the rows of a body.json."""
     try:
         return [BodyRow(**row) for row in json.loads(path.read_text(encoding="utf-8"))]
     except (OSError, ValueError, TypeError) as error:

@@ -120,11 +120,7 @@ def stored_answers(path: Path = PEER_ANSWERS) -> Mapping[str, tuple[str, Quantit
 
 
 def peer_distances(extreme: Extreme, result: ContactResult) -> dict[str, float]:
-    """Return the relative differences from CalculiX's stored result; empty if there is none.
-
-    Raises:
-        InputError: the stored result belongs to an earlier version of the case.
-    """
+    """Return the relative differences from CalculiX's stored result; empty if there is none."""
     if extreme.model not in PEER_MODELS or extreme.label not in stored_answers():
         return {}
     stored_hash, peer = stored_answers()[extreme.label]

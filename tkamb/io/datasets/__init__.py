@@ -108,10 +108,6 @@ def download(dataset: Dataset, to: Path, url: str | None = None) -> Got:
 
     Returns:
         Names of the files. A file without a known address counts as absent.
-
-    Raises:
-        InputError: pooch is not installed, the download fails, or the content of a downloaded or
-            existing file has another SHA-256. Complete files stay.
     """
     try:
         import pooch
@@ -139,10 +135,6 @@ def take_from(dataset: Dataset, to: Path, folder: Path) -> Got:
 
     Returns:
         Names of the files. A file that is not in the folder counts as absent.
-
-    Raises:
-        InputError: the folder does not exist, it holds no file of the data set, or the content
-            of a source or existing file has another SHA-256.
     """
     if not folder.is_dir():
         raise InputError("is not a folder", folder, "give the folder of what you downloaded")

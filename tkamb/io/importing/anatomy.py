@@ -85,10 +85,6 @@ def find_leg(model: OpenSimModel, side: str, knee: str | None = None) -> Leg:
         side: "right" or "left".
         knee: name of the femorotibial joint; None: the joint with "knee" or "femorotibial" in its
             name.
-
-    Raises:
-        InputError: the joint does not exist, the model has not exactly one joint above the femur
-            and one below the tibia, or the thigh or shank has an impossible length.
     """
     try:
         joint, hip, ankle, femur, tibia = _joints(model, side, knee)

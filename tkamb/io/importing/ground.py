@@ -50,9 +50,6 @@ def with_external_loads(request: ImportRequest, foot: tuple[str, ...]) -> Import
     """Return a request whose list of external loads is replaced by its table and the foot's forces.
 
     A request without such a list does not change. `foot` are the names of the foot's bodies.
-
-    Raises:
-        InputError: the list or its table cannot be read, or no force of it acts on the foot.
     """
     if request.grf is None or request.grf.suffix.lower() != ".xml":
         return request
@@ -142,9 +139,6 @@ def find_ground(request: ImportRequest, leg: Leg, axes: str, feet: Feet | None) 
     Args:
         axes: axes of the recording and table that point forward, up and right.
         feet: positions of the feet; None: unknown.
-
-    Raises:
-        InputError: the plates or columns cannot be used, or both feet loaded one plate.
     """
     request, side = with_external_loads(request, leg.foot), leg.side
     if request.grf is not None:
@@ -342,9 +336,6 @@ def common_interval(
         interval: requested start and end, s; None: all of the motion.
         span: times of the ground reaction's first and last sample, s; None: the ground reaction
             is from the recording of the motion.
-
-    Raises:
-        InputError: the interval contains fewer than two frames of the motion.
     """
     start, end = interval or (float(time[0]), float(time[-1]))
     if span is None or (span[0] <= start + 1e-9 and span[1] >= end - 1e-9):

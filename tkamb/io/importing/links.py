@@ -57,9 +57,6 @@ def mesh_frame(leg: Leg, part: str, wished_name: str | None) -> MeshFrame:
         part: "femoral component", "insert" or "patellar button".
         wished_name: name of the offset frame or body; None: the first frame with the part in its
             name.
-
-    Raises:
-        InputError: no frame has this name, or no frame has the part in its name.
     """
     model = leg.model
     group = {
@@ -127,11 +124,7 @@ class Links:
     remarks: tuple[str, ...]
 
     def body_in_link(self, body: str) -> tuple[str, Array]:
-        """Return the link that moves with a body, and the body's pose (4, 4) in it.
-
-        Raises:
-            InputError: no link moves with the body.
-        """
+        """Return the link that moves with a body, and the body's pose (4, 4) in it."""
         leg = self.leg
         for link, bodies, link_pose in (
             ("femur", leg.femur, self.femur),
@@ -186,9 +179,6 @@ def find_links(
         axes: axes of the meshes that point anterior, superior and right.
         frames: part of the implant -> name of its mesh's frame; None: inferred from the names.
         with_button: whether the implant has a patellar button.
-
-    Raises:
-        InputError: a mesh has no frame, or is rotated too far from the bone's axes.
     """
     turn = pose(axes_rotation(axes), np.zeros(3))
     text: list[str] = []
@@ -214,11 +204,7 @@ def find_links(
 def _anatomical(
     leg: Leg, frame: MeshFrame, body: str, turn: Array, part: str, remarks: list[str]
 ) -> Array:
-    """Return the pose (4, 4) of a part in a body, with the part's frame turned to anatomical axes.
-
-    Raises:
-        InputError: the part is rotated too far from the bone's axes.
-    """
+    """Return the pose (4, 4) of a part in a body, with the part's frame turned to anatomical axes."""
     assert frame.pose is not None
     pose = leg.in_body(frame.body, body) @ frame.pose @ inverse(turn)
     nearest, _ = quarter_turn(pose[:3, :3])

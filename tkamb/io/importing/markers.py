@@ -40,11 +40,7 @@ class ModelSegment:
 def model_segments(
     links: Links, recorded: Table, without: Sequence[str] = ()
 ) -> list[ModelSegment]:
-    """Return the segments with at least three markers: shank, thigh, and possibly foot, pelvis.
-
-    Raises:
-        InputError: shank or thigh has fewer than three markers in the recording.
-    """
+    """Return the segments with at least three markers: shank, thigh, and possibly foot, pelvis."""
     result = seen_segments(links, recorded, without)
     for name in ("shank", "thigh"):
         segment = result[name]
@@ -70,11 +66,7 @@ def model_segments(
 def seen_segments(
     links: Links, recorded: Table, without: Sequence[str] = ()
 ) -> dict[str, ModelSegment]:
-    """Return shank, thigh, foot and pelvis with the markers that are visible in any frame.
-
-    Raises:
-        InputError: the recording has no marker with a label from `without`.
-    """
+    """Return shank, thigh, foot and pelvis with the markers that are visible in any frame."""
     leg = links.leg
     joints = {"foot": (np.zeros(3), leg.ankle_centre), "pelvis": (links.hip, leg.hip_centre)}
     labels, dropped = _seen_labels(recorded, without)
@@ -171,11 +163,7 @@ def _clashing_prefixes(labels: list[str], needed: Sequence[str]) -> list[str]:
 
 
 def with_prefix(recorded: Table, prefix: str) -> Table:
-    """Return the table with only the markers that have a prefix, like "JW" in "JW:RHeel".
-
-    Raises:
-        InputError: no label begins with the prefix.
-    """
+    """Return the table with only the markers that have a prefix, like "JW" in "JW:RHeel"."""
     wished_prefix = prefix.rstrip(":")
     labels = recorded_labels(recorded)
     prefixes = list(dict.fromkeys(label.rpartition(":")[0] for label in labels))
@@ -221,9 +209,6 @@ def facing(segments: list[ModelSegment], recorded: Table) -> Facing:
 
     In each segment y points up and x forward. The function averages these axes over all frames and
     segments, and returns the nearest axes of the file.
-
-    Raises:
-        InputError: on average the segments are not upright, or face no direction.
     """
     upright = [s for s in segments if s.name in ("shank", "thigh", "pelvis")]
     turns = []

@@ -75,11 +75,7 @@ class ImportedPatient:
 
 
 def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
-    """Return a patient's URDF and scene.
-
-    Raises:
-        InputError: a file or value cannot be used.
-    """
+    """Return a patient's URDF and scene."""
     model = read_osim(request.model, partial=True)
     leg = find_leg(model, request.side, request.knee)
     meshes = request.meshes
@@ -191,10 +187,6 @@ def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[st
 
     Existing files do not change. Scenes may share a file with the same content. If an error occurs,
     all new files are removed.
-
-    Raises:
-        InputError: the folder cannot be written, a file of the same name has another content, or
-            the scene cannot be loaded.
     """
     scene = folder / name
     if os.path.lexists(scene):
@@ -286,11 +278,7 @@ def marker_lines(case: Case) -> tuple[str, ...]:
 
 
 def _mass_scale(request: ImportRequest, leg: Leg) -> tuple[float, str]:
-    """Return the factor on the model's masses, and a remark on it.
-
-    Raises:
-        InputError: the model's leg has no mass, or the masses differ too much.
-    """
+    """Return the factor on the model's masses, and a remark on it."""
     model, subject = leg.model.mass_kg, request.mass_kg
     leg_mass = sum(leg.model.bodies[b].mass_kg for b in (*leg.femur, *leg.tibia, *leg.foot))
     if leg_mass <= 0.0:
@@ -323,9 +311,6 @@ def _leg_scale(request: ImportRequest, leg_mass: float) -> tuple[float, str]:
     Args:
         request: the import, with the subject's mass.
         leg_mass: mass of thigh, shank and foot in the model, kg.
-
-    Raises:
-        InputError: the model has neither a leg's nor a whole body's mass.
     """
     subject = request.mass_kg
     share, target = leg_mass / subject, LEG_MASS_SHARE * subject

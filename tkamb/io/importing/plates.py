@@ -65,13 +65,7 @@ class _Column:
 
 
 def table_forces(table: Table) -> list[TableForce]:
-    """Return the forces of a table, in the order of their columns.
-
-    Raises:
-        InputError: one axis has two columns, or a moment column belongs to no force while a force
-            has no moment.
-
-    """
+    """Return the forces of a table, in the order of their columns."""
     columns = [c for name in table.columns if (c := _parsed_column(name)) is not None]
     result: dict[str, TableForce] = {}
     for column in columns:
@@ -338,9 +332,6 @@ def own_plates(
 
     Args:
         side: "left" or "right".
-
-    Raises:
-        InputError: no plate was under the foot, or both feet stood on one plate.
     """
     foot_plates = list(dict.fromkeys(load.plate for load in loads if load.side == side))
     others = {load.plate for load in loads if load.side != side}
@@ -365,11 +356,7 @@ def own_plates(
 
 
 def check_upward(forces: list[RecordedForce], feet: Feet, side: str) -> list[str]:
-    """Return a line on each plate whose force points down under the other foot.
-
-    Raises:
-        InputError: the force of a plate under this foot, or under no known foot, points down.
-    """
+    """Return a line on each plate whose force points down under the other foot."""
     lines = []
     for force in forces:
         if not force.pushes_down:
@@ -395,11 +382,7 @@ def common_surface(loads: list[Load], plates: tuple[int | str, ...]) -> float:
 def known_interval(
     loads: list[Load], plates: tuple[int | str, ...], feet: Feet
 ) -> tuple[float, float]:
-    """Return the times, s, of the first and last frame between the foot's first and last load.
-
-    Raises:
-        InputError: fewer than two frames lie between the first and the last load.
-    """
+    """Return the times, s, of the first and last frame between the foot's first and last load."""
     foot_loads = [load for load in loads if load.plate in plates]
     start = min(load.start for load in foot_loads)
     end = max(load.end for load in foot_loads)

@@ -92,9 +92,6 @@ def model_motion(links: Links, recorded: Table) -> ModelMotion:
 
     Args:
         recorded: table of the coordinates. A column has the coordinate's name or path in the model.
-
-    Raises:
-        InputError: the column of knee flexion is missing, or the unit of angles is unknown.
     """
     leg = links.leg
     kinematics = Kinematics(leg.model)
@@ -194,9 +191,6 @@ def shank_markers(
         segments: name of a segment -> its visible markers.
         femur: poses of the femur's body in the tibia link, m, shape (n, 4, 4).
         axes: axes of the file that point forward, up and right.
-
-    Raises:
-        InputError: there are fewer than three points.
     """
     points = segments["shank"].points
     centres: dict[str, JointCentre] = {}
@@ -326,9 +320,6 @@ def read_poses(
         axes: axes of the meshes that point anterior, superior and right.
         cutoff_Hz: cut-off frequency of the scene's low-pass filter, Hz.
         interval: start and end of the part to compute, s; None: the whole recording.
-
-    Raises:
-        InputError: file, columns, units or times cannot be used.
     """
     turn = pose(axes_rotation(axes), np.zeros(3))
     placement = insert_placement(insert, axes_rotation(axes)) @ turn

@@ -150,10 +150,6 @@ def register(
         segments: "shank" and "thigh", and their neighbours, with the model's markers.
         trials: name of a trial -> segment -> measured markers (n, m, 3), m, in the laboratory, gaps
             NaN, in the order of the segment's points.
-
-    Raises:
-        InputError: no frame shows three markers of shank and thigh, or the search does not
-            converge.
     """
     leg = _MarkedLeg(links, segments)
     measured = _chosen_frames(leg, trials)

@@ -105,9 +105,6 @@ def calibrated_markers(
         table: markers and joints of the scene. Markers that the trial lacks are ignored.
         pose_insert_in_tibia: pose of the insert frame in the tibia link, shape (4, 4), mirrored
             for a left leg.
-
-    Raises:
-        InputError: the trial cannot be read, or its markers do not fit.
     """
     labels = [column[:-2] for column in recorded.columns if column.endswith("_x")]
     points = [
@@ -159,11 +156,7 @@ class Trial:
 
 
 def from_markers(request: ImportRequest, leg: Leg, links: Links, recorded: Table) -> Trial:
-    """Return a trial whose motion is from markers.
-
-    Raises:
-        InputError: markers, plates or interval cannot be used.
-    """
+    """Return a trial whose motion is from markers."""
     segments = model_segments(links, recorded, request.without)
     facing = _facing(request, segments, recorded)
     foot_positions = marked_feet(recorded, facing.axes, feet(leg, recorded, OTHER[leg.side]))
@@ -193,11 +186,7 @@ def from_markers(request: ImportRequest, leg: Leg, links: Links, recorded: Table
 def from_poses(
     request: ImportRequest, leg: Leg, links: Links, recorded: Table, poses: RecordedPoses
 ) -> Trial:
-    """Return a trial of recorded knee poses, with markers that give the shank's pose.
-
-    Raises:
-        InputError: markers or plates cannot be used.
-    """
+    """Return a trial of recorded knee poses, with markers that give the shank's pose."""
     segments = seen_segments(links, recorded, request.without)
     facing = _facing(request, [s for s in segments.values() if len(s.points) >= 3], recorded)
     stance = poses.femur[poses.in_stance]
@@ -217,11 +206,7 @@ def from_poses(
 
 
 def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: Table) -> Trial:
-    """Return a trial whose motion is in the model's coordinates.
-
-    Raises:
-        InputError: the knee flexion is missing, or the forces cannot be assigned to the foot.
-    """
+    """Return a trial whose motion is in the model's coordinates."""
     for joint in way_to_pelvis(leg):
         if joint.unread:
             raise InputError(joint.unread)
@@ -344,9 +329,6 @@ def with_registered_markers(
 
     Without `request.register` the markers are registered if they misfit the model. The registration
     is None if they are not.
-
-    Raises:
-        InputError: a trial cannot be read, or the registration fails.
     """
     assert scene.markers is not None
     segments = list(scene.markers.segments)

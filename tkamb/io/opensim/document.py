@@ -71,11 +71,7 @@ class Document:
         return None
 
     def text(self, element: Element, *tags: str, default: str | None = None) -> str:
-        """Return the text of the first child with one of these tags.
-
-        Raises:
-            InputError: there is no text and no default.
-        """
+        """Return the text of the first child with one of these tags."""
         result = self.find(element, *tags)
         text = "" if result is None else (result.text or "").strip()
         if text or default is not None:
@@ -93,9 +89,6 @@ class Document:
             name: name of the socket, such as "parent_frame".
             old_tags: tags of the socket in version 3.
             default: value for an unconnected socket; "": an unconnected socket is an error.
-
-        Raises:
-            InputError: the socket is not connected, and there is no default.
         """
         for holder in element.findall("connectors/*"):
             if holder.get("name") == name:
@@ -113,11 +106,7 @@ class Document:
     def numbers(
         self, element: Element, *tags: str, count: int | None = None, default: str | None = None
     ) -> Array:
-        """Return the numbers (count,) in a child's text, which may have brackets and commas.
-
-        Raises:
-            InputError: the numbers are missing or not finite, or their number is not `count`.
-        """
+        """Return the numbers (count,) in a child's text, which may have brackets and commas."""
         text = self.text(element, *tags, default=default)
         try:
             values = np.array(_number_words(text, count), float)
@@ -161,11 +150,7 @@ class Document:
             yield from holder
 
     def function(self, element: Element) -> Function:
-        """Return the function that an element describes.
-
-        Raises:
-            InputError: the class of the function is not supported, or the function is malformed.
-        """
+        """Return the function that an element describes."""
         match element.tag:
             case "Constant":
                 return Linear(0.0, self.number(element, "value", default=0.0))
@@ -239,11 +224,7 @@ _END = re.compile(r"</OpenSimDocument\s*>")
 
 
 def open_document(path: Path) -> tuple[Element, list[str]]:
-    """Return the root element of an OpenSim file after inclusion of further files, and notices.
-
-    Raises:
-        InputError: the file, or a needed file that it includes, cannot be read.
-    """
+    """Return the root element of an OpenSim file after inclusion of further files, and notices."""
     notices: list[str] = []
     root = _read(path, notices)
     for element in root:

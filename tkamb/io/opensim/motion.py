@@ -190,11 +190,7 @@ def _column_of(name: str, recorded: Table) -> str | None:
 
 
 def _angle_scale(angles: dict[str, Array], recorded: Table) -> float:
-    """Return the factor from the angles' unit to rad, from the file's header.
-
-    Raises:
-        InputError: the header does not state the unit, or the angles contradict it.
-    """
+    """Return the factor from the angles' unit to rad, from the file's header."""
     largest = max(float(np.abs(values).max()) for values in angles.values())
     worst = max(angles, key=lambda name: np.abs(angles[name]).max())
     if recorded.in_degrees is None:

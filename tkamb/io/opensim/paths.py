@@ -74,9 +74,6 @@ class LineSet:
 
     Args:
         names: names of muscles and ligaments; None: all muscles.
-
-    Raises:
-        InputError: the model has no muscle or ligament with one of the names.
     """
 
     def __init__(self, kinematics: Kinematics, names: Iterable[str] | None = None) -> None:

@@ -184,11 +184,7 @@ def _concerns(
 def _opened(
     root: Element, path: Path, partial: bool, notices: list[str]
 ) -> tuple[Document, Element]:
-    """Return the document and its <Model>. `notices` gets a line for each unit without a name.
-
-    Raises:
-        InputError: the file is no OpenSim model, is too old, or has units other than m and N.
-    """
+    """Return the document and its <Model>. `notices` gets a line for each unit without a name."""
     model = root.find("Model")
     if root.tag != "OpenSimDocument" or model is None:
         raise InputError(

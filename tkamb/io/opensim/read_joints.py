@@ -87,9 +87,6 @@ class Frames:
             socket: path or name of a frame, such as "/bodyset/tibia", "tibia", "tibia_offset" or
                 "/jointset/knee/tibia_offset".
             owner: joint with the frames that are searched first.
-
-        Raises:
-            InputError: the frame does not exist or could not be read.
         """
         steps = [step for step in socket.split("/") if step not in ("", ".", "..")]
         in_body = np.eye(4)
@@ -139,10 +136,6 @@ def _station_defined(
     Three stations are the points a, b, c; the fourth is the origin. The frame's axis `ab_axis` is
     along b - a, and its axis `ab_x_ac_axis` is along (b - a) × (c - a). The third axis completes a
     right-handed frame (OpenSim's StationDefinedFrame, https://opensim-org.github.io).
-
-    Raises:
-        InputError: a station does not exist, stations are in different frames, or points are
-            collinear.
     """
     where, points, parents = document.where(element), [], set()
     for name in ("point_a", "point_b", "point_c", "origin_point"):
@@ -180,11 +173,7 @@ def _station_defined(
 def read_joints(
     document: Document, model: Element, frames: Frames
 ) -> tuple[list[Joint], dict[str, Coordinate]]:
-    """Return the joints and coordinates in the file's order.
-
-    Raises:
-        InputError: the class of a joint is not supported, or a joint is malformed.
-    """
+    """Return the joints and coordinates in the file's order."""
     joints: list[Joint] = []
     coordinates: dict[str, Coordinate] = {}
     for element, child in _joint_elements(document, model):
@@ -295,9 +284,6 @@ def _named_axes(
 
     As in OpenSim, the name of an axis decides its place, not its position in the file. Axes without
     any name are in the order of `AXES`.
-
-    Raises:
-        InputError: more than six axes, a name that is no axis, or two axes of one name.
     """
     entries: dict[str, Element] = {}
     found: list[tuple[str, Element]] = []
@@ -361,9 +347,6 @@ def outwards(document: Document, joints: list[Joint], bodies: Iterable[str]) -> 
 
     A partial reading leaves out a joint that closes a loop. If no chain of joints connects a body
     with ground, it welds the body to ground and marks the weld as unread.
-
-    Raises:
-        InputError: the joints form a loop, or a body has no chain of joints to ground.
     """
     path = document.path
     reached, waiting, ordered = {GROUND}, list(joints), []

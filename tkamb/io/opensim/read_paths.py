@@ -48,11 +48,7 @@ METHODS = ("hybrid", "midpoint", "axial")
 
 
 def read_wrap_objects(document: Document, model: Element, frames: Frames) -> dict[str, WrapObject]:
-    """Return name -> wrap object, of all bodies. The first of equal names counts, as in OpenSim.
-
-    Raises:
-        InputError: a shape is not supported, or a dimension is not positive.
-    """
+    """Return name -> wrap object, of all bodies. The first of equal names counts, as in OpenSim."""
     result: dict[str, WrapObject] = {}
     ground = [] if (element := model.find("Ground")) is None else [element]
     for body in (*ground, *document.objects(model, "BodySet")):
@@ -104,11 +100,7 @@ def read_forces(
     coordinates: Mapping[str, Coordinate],
     wraps: Mapping[str, WrapObject],
 ) -> tuple[dict[str, OpenSimMuscle], dict[str, OpenSimLigament], list[str]]:
-    """Return muscles, ligaments, and "class 'name'" of each force that is left out.
-
-    Raises:
-        InputError: a class of muscle or ligament is not supported, or a path is malformed.
-    """
+    """Return muscles, ligaments, and "class 'name'" of each force that is left out."""
     muscles: dict[str, OpenSimMuscle] = {}
     ligaments: dict[str, OpenSimLigament] = {}
     left_out = []

@@ -123,11 +123,7 @@ class Recording:
         )
 
     def channel(self, name: str) -> Array:
-        """Return the samples (k,) of a channel that belongs to no plate.
-
-        Raises:
-            InputError: no such channel, several of that name, or the channels are unreadable.
-        """
+        """Return the samples (k,) of a channel that belongs to no plate."""
         if "channels" in self.faults:
             raise self.faults["channels"]
         if name in self.equal_channels:
@@ -148,10 +144,6 @@ def read_c3d(path: str | Path, units: GivenUnits | None = None) -> Recording:
 
     Args:
         units: the user's units; None: those of the file.
-
-    Raises:
-        InputError: no such file, not a regular file, not C3D, cut short, no valid frame rate, or
-            a contradiction between header and parameters.
     """
     path = Path(path)
     try:

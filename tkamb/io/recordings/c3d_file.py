@@ -82,11 +82,7 @@ class Parameters:
     damaged: set[str] = field(default_factory=set)
 
     def get(self, name: str) -> Any:
-        """Return the values of "GROUP:NAME"; None if the file has no such parameter.
-
-        Raises:
-            InputError: the parameter is damaged.
-        """
+        """Return the values of "GROUP:NAME"; None if the file has no such parameter."""
         if name in self.damaged:
             raise InputError(f"has a damaged parameter {name}", self.path, EXPORT)
         return self.values.get(name)
@@ -151,11 +147,7 @@ class C3dFile:
 
 
 def parse_c3d(content: bytes, path: Path) -> C3dFile:
-    """Return the content of a C3D file, from its bytes.
-
-    Raises:
-        InputError: not C3D, cut short, or a contradiction between header and parameters.
-    """
+    """Return the content of a C3D file, from its bytes."""
     if len(content) < BLOCK or content[1] != _KEY:
         raise InputError("is not a C3D file", path, "give a recording in C3D")
     start = (content[0] - 1) * BLOCK
@@ -272,9 +264,6 @@ def _agreed_header(
 
     If header and parameters contradict each other, the frames of exactly one of their layouts must
     end within the last block of the file.
-
-    Raises:
-        InputError: they contradict each other, and the size of the file does not decide.
     """
     error = _disagreement(header, parameters, path)
     if error is None:
@@ -409,10 +398,6 @@ class _Data:
 
         Header and POINT:DATA_START both state the first block of the data. If they differ, the
         frames must fit the size of the file from exactly one of the two blocks.
-
-        Raises:
-            InputError: no stated block lies within the file, or the frames fit from neither block
-                or from both.
         """
         stated = self.parameters.integers("POINT:DATA_START")
         blocks = list(dict.fromkeys([self.header.data_block, *stated[:1]]))
@@ -468,12 +453,7 @@ class _Data:
         return header
 
     def _count(self, stored: int, notices: list[str]) -> int:
-        """Return the number of frames to read; the file has room for `stored` frames.
-
-        Raises:
-            InputError: the file states no frame, holds fewer frames than it states, or is too
-                long for its 16-bit frame number.
-        """
+        """Return the number of frames to read; the file has room for `stored` frames."""
         stated = self._stated()
         other = self.parameters.integers("POINT:FRAMES")
         spare = math.ceil(BLOCK / self._frame)

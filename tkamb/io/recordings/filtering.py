@@ -77,10 +77,6 @@ def differentiate_coordinates(
 
     Returns:
         Value, first and second derivative, each (f, k) or (f,).
-
-    Raises:
-        InputError: non-finite, unsorted or too few samples, cut-off at or above half the
-            sampling rate, motion too short for the cut-off, `at` outside `time`.
     """
     time, values = np.asarray(time, float), np.asarray(coordinates, float)
     at = time if at is None else np.asarray(at, float)
@@ -118,9 +114,6 @@ def differentiate_poses(
         Poses (f, 4, 4), spatial velocity (f, 6) and spatial acceleration (f, 6). Both are linear,
         then angular, in the body's axes at the body's origin: v = (R^T p', omega), a = dv/dt
         component by component. This is Pinocchio's convention for a free flyer.
-
-    Raises:
-        InputError: as `differentiate_coordinates`.
     """
     poses = np.asarray(poses, float)
     if not np.isfinite(poses).all():

@@ -199,12 +199,7 @@ class ForcePlate:
 
 
 def force_plate(record: PlateRecord) -> ForcePlate:
-    """Return the wrench that a plate measured.
-
-    Raises:
-        InputError: an unknown type or unit, too few channels, corners that span no surface, or no
-            calibration matrix.
-    """
+    """Return the wrench that a plate measured."""
     kind, where = record.kind, record.where
     if kind not in CHANNELS:
         raise InputError(f"is of type {kind}", where, "use a plate of type 1 to 5")

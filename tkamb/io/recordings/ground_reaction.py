@@ -127,10 +127,6 @@ def load_ground_reaction(source: GroundReactionTable, time: Array, side: Side) -
         source: the scene's [ground_reaction].
         time: (f,) s of the frames, on the file's clock.
         side: side of the knee; a left foot is mirrored.
-
-    Raises:
-        InputError: the file or its columns cannot be used or do not cover `time`, the force is not
-            mainly upwards, or the centre of pressure of a loaded plate is missing or not level.
     """
     from_plates = _is_c3d(source)
     recorded = _complete_part((_read_plates if from_plates else _read_table)(source), time, source)
@@ -175,9 +171,6 @@ def recorded_wrench(source: GroundReactionTable) -> tuple[Array, Array, float]:
     """Return times (k,) s, wrench on the foot (k, 6) N and N·m, and plate level (m) of a table.
 
     The wrench is in the laboratory's axes, about the laboratory's origin.
-
-    Raises:
-        InputError: the columns cannot be used, or the force is not mainly upwards.
     """
     recorded = _read_table(source)
     _check_upward(recorded.force, source)

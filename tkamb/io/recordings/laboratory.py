@@ -96,9 +96,6 @@ def laboratory_rotation(axes: str, path: Path) -> Array:
 
     Args:
         axes: the file's axes that point forward, up and right, like "-x,+y,-z".
-
-    Raises:
-        InputError: the axes are left-handed.
     """
     rotation = np.zeros((3, 3))
     for row, axis in enumerate(axes.split(",")):
@@ -120,11 +117,7 @@ def check_roles(columns: dict[str, str], roles: tuple[str, ...], path: Path, tab
 
 
 def angle_scale(table: "Table", angle_unit: str | None) -> float:
-    """Return radians per unit of angle.
-
-    Raises:
-        InputError: the file's header states another unit than the scene.
-    """
+    """Return radians per unit of angle."""
     if table.in_degrees is not None and table.in_degrees != (angle_unit == "deg"):
         stated = "degrees" if table.in_degrees else "radians"
         raise InputError(
@@ -143,11 +136,7 @@ def poses_of_columns(
     angle_unit: str | None,
     length_unit: str | None,
 ) -> Array:
-    """Return the poses (n, 4, 4) of columns rotation_1..3 and translation_1..3, m.
-
-    Raises:
-        InputError: missing column, a gap, or a sequence with the same axis twice in a row.
-    """
+    """Return the poses (n, 4, 4) of columns rotation_1..3 and translation_1..3, m."""
     angles, places = (
         np.stack(
             [table.complete_column(columns.get(f"{kind}_{k}", f"{kind}_{k}")) for k in (1, 2, 3)],

@@ -96,10 +96,6 @@ def load_marker_motion(
         source: the scene's [motion], with markers.
         side: side of the knee; a left leg and its laboratory are mirrored.
         pose_insert_in_tibia: (4, 4) m, pose in the patient's URDF, mirrored for a left knee.
-
-    Raises:
-        InputError: file, labels or markers cannot be used, the fit is poor or does not converge,
-            or the interval has a gap.
     """
     assert source.markers is not None
     recorded = read_table(source.file, source.format)
@@ -154,9 +150,6 @@ def leg_segments(
     """Return the segments, and segment -> measured markers (n, m, 3) m, gaps NaN.
 
     The markers are in the laboratory's axes; those of a left leg are mirrored.
-
-    Raises:
-        InputError: the recording lacks a marker.
     """
     scale = recorded.unit_scale(length_unit, "length_unit")
     rotation = laboratory_rotation(markers.laboratory_axes, recorded.path)

@@ -47,9 +47,6 @@ def marker_trajectories(table: Table, names: list[str], metres_per_unit: float) 
     """Return the markers (n, m, 3), m, in the file's axes; gaps are NaN.
 
     Labels are matched as in `matched_labels`.
-
-    Raises:
-        InputError: a marker is not in the file; the message lists similar names.
     """
     labels = [column[:-2] for column in table.columns if column.endswith("_x")]
     matched = matched_labels(names, labels)
@@ -67,9 +64,6 @@ def shank_points(source: TibiaTable, recorded: Table) -> tuple[Array, Array]:
 
     Returns:
         Points (n, m, 3), m, in the file's axes, gaps NaN; reference points (m, 3), m.
-
-    Raises:
-        InputError: no unit of length, a missing marker, or a poor fit of the neighbour's markers.
     """
     scale = recorded.unit_scale(source.length_unit, "length_unit")
     points = [marker_trajectories(recorded, [name], scale) for name in source.markers_mm]
@@ -109,9 +103,6 @@ def fit_rigid(points: Array, reference: Array, name: str = "the tibia") -> tuple
         pose_body_in_world (n, 4, 4) and the root mean square distance (n,), m, between
         measured and fitted markers.
 
-    Raises:
-        InputError: fewer than three markers, or all on one line.
-
     Reference: Kabsch, Acta Cryst A32:922 (1976), doi:10.1107/S0567739476001873.
     """
     if not _spans(reference):
@@ -140,9 +131,6 @@ def fit_seen(points: Array, reference: Array, weights: Array, name: str) -> tupl
 
     Returns:
         pose_body_in_world (n, 4, 4), and root mean square distance (n,) m of visible markers.
-
-    Raises:
-        InputError: the reference markers fix no orientation.
     """
     visible = np.isfinite(points).all(axis=2)
     if not _spans(reference[weights > 0]):
@@ -203,9 +191,6 @@ def complete_run(
         time: (n,) s.
         start: start of the interval, s.
         end: end of the interval, s.
-
-    Raises:
-        InputError: the recording does not cover the interval, or a marker is missing in it.
     """
     first = int(np.searchsorted(time, start + 1e-9, side="right")) - 1
     last = int(np.searchsorted(time, end - 1e-9, side="left"))

@@ -69,9 +69,6 @@ def load_measured_force(source: MeasuredTable, time: Array) -> MeasuredForce:
     Args:
         source: the scene's [measured].
         time: (f,) s, times of the motion, which must overlap with the measurement.
-
-    Raises:
-        InputError: no such file or column, or no measurement during the motion.
     """
     table = read_table(source.file, source.format)
     name = source.columns.get("time", "time")
@@ -144,11 +141,6 @@ def load_envelopes(source: EmgTable, motion: Array) -> Envelopes:
     Args:
         source: the scene's [muscles.emg].
         motion: (f,) s, times of the motion, which must overlap with the recording.
-
-    Raises:
-        InputError: no such file or channel, no measurement during the motion, a gap, uneven
-            samples, a cut-off above half the rate, too short a recording, or a channel without
-            signal.
     """
     time, signals, remarks = _signals(source)
     step = np.diff(time)
@@ -187,10 +179,6 @@ def envelope(
         signal: (n,) evenly spaced samples.
         high_pass_Hz: cut-off of the high-pass before rectifying; "none": only the mean is
             subtracted.
-
-    Raises:
-        InputError: a gap, a cut-off at or above half the rate, or a signal shorter than a
-            period of a cut-off.
     """
     if not np.isfinite(signal).all():
         raise InputError("has a gap or a value that is not finite", "EMG", "fill or cut the gap")

@@ -188,11 +188,7 @@ class MeshHealth:
 
 
 def check_mesh(path: str | Path) -> MeshHealth:
-    """Return content and defects of a mesh file, and guesses of unit and axes.
-
-    Raises:
-        InputError: no such file, not a mesh, no triangles, or NaN.
-    """
+    """Return content and defects of a mesh file, and guesses of unit and axes."""
     vertices, faces = read_triangles(path)
     extents, units, scale = _measure(vertices, faces)
     mended = repair(vertices * scale, faces)
@@ -226,11 +222,7 @@ def _roughness(mended: Repair, units: list[str]) -> tuple[str, ...]:
 
 
 def mended_mesh(path: str | Path) -> tuple[Repair, float]:
-    """Return the repaired mesh, in m, and the guessed metres per unit of the file.
-
-    Raises:
-        InputError: as for `check_mesh`.
-    """
+    """Return the repaired mesh, in m, and the guessed metres per unit of the file."""
     vertices, faces = read_triangles(path)
     scale = _measure(vertices, faces)[2]
     return repair(vertices * scale, faces), scale

@@ -60,9 +60,6 @@ def axes_rotation(axes: str) -> Array:
 
     Returns:
         R with p_anatomical = R p_mesh. Its entries are 0 and ±1, so that coordinates stay exact.
-
-    Raises:
-        InputError: not three different axes, or a left-handed system (a mirror image).
     """
     names = [name.strip() for name in axes.split(",")]
     letters = sorted(name[1:] if name[:1] in ("+", "-") else name for name in names)
@@ -107,11 +104,6 @@ def load_surface(
 
     Returns:
         The surface, m: x anterior, y superior, z right. The origin is that of the mesh.
-
-    Raises:
-        InputError: no such file, no mesh, no triangles, NaN, an implausible size, not a surface,
-            or not closed although `closed`. Also if a part of an implant is an open sheet or
-            several separate bodies.
     """
     rotation = axes_rotation(axes)
     if unit not in LENGTH:
@@ -194,11 +186,7 @@ def _check_space(path: str | Path, axes: str) -> None:
 
 
 def read_triangles(path: str | Path) -> tuple[Array, Indices]:
-    """Return the vertices (n, 3) in file units and the faces (k, 3) of a mesh file, unrepaired.
-
-    Raises:
-        InputError: no such file, not a mesh, no triangles, or NaN.
-    """
+    """Return the vertices (n, 3) in file units and the faces (k, 3) of a mesh file, unrepaired."""
     path = Path(path)
     vertices, faces = read_vtp(path) if path.suffix.lower() == ".vtp" else _read_mesh(path)
     if len(faces) == 0:

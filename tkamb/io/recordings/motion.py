@@ -122,9 +122,6 @@ def load_motion(
         pose_femoral_mesh_in_femur: (4, 4) m; not mirrored.
         released: names of the released coordinates; they need no column.
         pose_insert_in_tibia: (4, 4) m, needed for markers; mirrored for a left knee.
-
-    Raises:
-        InputError: file, columns, times, filter or cycle cannot be used.
     """
     if source.markers is not None:
         assert pose_insert_in_tibia is not None

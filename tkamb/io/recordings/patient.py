@@ -138,9 +138,6 @@ def load_urdf(patient: PatientTable, with_patella: bool) -> str:
     Args:
         patient: the scene's [patient].
         with_patella: whether the patella and its joints are needed.
-
-    Raises:
-        InputError: a missing file, link or joint, a wrong axis, or an impossible inertia.
     """
     path = patient.urdf
     robot = _parse(path)

@@ -270,9 +270,6 @@ def read_binary_stl(path: Path) -> Array | None:
     corners and two bytes (little-endian). Consecutive solids are read as one. Bytes after the last
     triangle are ignored, with a notice on the logger "tkamb". If the number is 0 or the largest
     integer, all triangles are read: some programs never write the number.
-
-    Raises:
-        InputError: the file is cut short.
     """
     content = path.read_bytes()
     if len(content) < _HEADER or _is_text(content):
@@ -353,19 +350,12 @@ def read_vtp(path: str | Path) -> tuple[Array, Indices]:
 
     Polygons of more than three corners are cut into triangles. Vertex cells, lines and data arrays
     are not read.
-
-    Raises:
-        InputError: no such file, not PolyData, cut short, triangle strips, or another encoding.
     """
     return _read(path, lambda data: data.triangles())
 
 
 def read_vtp_values(path: str | Path, name: str) -> Array:
-    """Return the values (n,) of a point data array of a .vtp file.
-
-    Raises:
-        InputError: as `read_vtp`, or there is no array of this name.
-    """
+    """Return the values (n,) of a point data array of a .vtp file."""
     return _read(path, lambda data: data.values(name))
 
 

@@ -70,11 +70,7 @@ class Table:
         return len(next(iter(self.columns.values())))
 
     def column(self, name: str) -> Array:
-        """Return one column.
-
-        Raises:
-            InputError: no such column (the message lists similar names), or several of this name.
-        """
+        """Return one column."""
         if name in self.equal:
             raise InputError(f"has two columns named '{name}'", self.path, "rename one")
         if name not in self.columns:
@@ -83,11 +79,7 @@ class Table:
         return self.columns[name]
 
     def complete_column(self, name: str) -> Array:
-        """Return one column, in which every value must be finite.
-
-        Raises:
-            InputError: no such column, or a value that is missing or not finite.
-        """
+        """Return one column, in which every value must be finite."""
         values = self.column(name)
         gaps = np.flatnonzero(~np.isfinite(values))
         if len(gaps):
@@ -122,9 +114,6 @@ class Table:
 
         Args:
             length_unit: unit that the scene states; None: the file's header states it.
-
-        Raises:
-            InputError: neither the scene nor the file states a unit, or they state different ones.
         """
         unit = length_unit or self.length_unit
         if unit not in LENGTH:
@@ -145,10 +134,6 @@ def read_table(path: Path, format: str | None = None) -> Table:
 
     Args:
         format: a name of `READERS`; by default the suffix.
-
-    Raises:
-        InputError: missing or unreadable file, unknown format, a malformed header or row, an
-            infinite number.
     """
     path = Path(path)
     kind = format or path.suffix.lower().lstrip(".")
@@ -158,11 +143,7 @@ def read_table(path: Path, format: str | None = None) -> Table:
 
 
 def with_unit(table: Table, length_unit: str | None) -> Table:
-    """Return a table with the unit of length that the user states; None: unchanged.
-
-    Raises:
-        InputError: the file states another unit.
-    """
+    """Return a table with the unit of length that the user states; None: unchanged."""
     if length_unit is None:
         return table
     if table.path.suffix.lower() == ".c3d" and table.length_unit is not None:
@@ -204,11 +185,7 @@ def read_csv(path: Path) -> Table:
 def _with_points(
     rows: list[tuple[int, list[str]]], sign: str, path: Path
 ) -> tuple[list[tuple[int, list[str]]], tuple[str, ...]]:
-    """Return rows with points in the numbers, and a notice on the separator.
-
-    Raises:
-        InputError: some numbers have a comma and others a point.
-    """
+    """Return rows with points in the numbers, and a notice on the separator."""
     cells = [cell.strip() for _, row in rows[1:] for cell in row]
     comma = next((cell for cell in cells if _COMMA_NUMBER.fullmatch(cell)), None)
     point = next((cell for cell in cells if "." in cell and _NUMBER.fullmatch(cell)), None)
@@ -467,9 +444,6 @@ def read_lines(path: Path) -> list[str]:
 
     A byte order mark decides the encoding; without one it is UTF-8. If the bytes are not valid
     UTF-8, it is Latin-1, which older programs write.
-
-    Raises:
-        InputError: no such file, or larger than a table may be.
     """
     content = read_bytes(path, TABLE_BYTES)
     encodings = [name for mark, name in BYTE_ORDER_MARKS.items() if content.startswith(mark)]

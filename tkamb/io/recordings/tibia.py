@@ -86,9 +86,6 @@ def load_tibia(source: TibiaTable, time: Array, side: Side, cutoff_Hz: Cutoff) -
         source: the scene's [tibia].
         time: (f,) s of the frames, on the file's clock.
         cutoff_Hz: cut-off of the motion, used if `source` states none.
-
-    Raises:
-        InputError: file, columns or markers cannot be used, or do not cover `time`.
     """
     cutoff: Cutoff = cutoff_Hz if source.cutoff_Hz is None else source.cutoff_Hz
     recorded = read_table(source.file)
@@ -113,11 +110,7 @@ def load_tibia(source: TibiaTable, time: Array, side: Side, cutoff_Hz: Cutoff) -
 
 
 def _odd_poses(recorded: Table, stamps: Array, poses: Array, time: Array) -> tuple[OddSample, ...]:
-    """Return the odd samples of the shank's two ends.
-
-    Raises:
-        InputError: an impossible position or speed.
-    """
+    """Return the odd samples of the shank's two ends."""
     near = (stamps >= time[0] - WINDOW) & (stamps <= time[-1] + WINDOW)
     ends = {
         "ankle": np.zeros(3),

@@ -206,11 +206,7 @@ def _common_part(scene: Scene) -> MotionTable | None:
 
 
 def load_case(scene: Scene) -> Case:
-    """Read the files that the scene names.
-
-    Raises:
-        InputError: a file cannot be read or used.
-    """
+    """Read the files that the scene names."""
     with_patella = scene.patella is not None
     chain = Chain(load_urdf(scene.patient, with_patella), with_patella)
     # Meshes take longer to read than tables. Tables come first: their errors then appear at once.
@@ -262,11 +258,7 @@ def load_case(scene: Scene) -> Case:
 
 
 def with_insert(case: Case, mesh: Path) -> Case:
-    """Return a case with another mesh file of the insert, in the same unit and axes.
-
-    Raises:
-        InputError: the file cannot be used.
-    """
+    """Return a case with another mesh file of the insert, in the same unit and axes."""
     implant = case.scene.implant
     assert implant.insert is not None
     insert = implant.insert.model_copy(update={"mesh": mesh})
@@ -307,12 +299,7 @@ PATELLA_TRANSLATIONS = [0, 1]
 
 
 def scaled_case(case: "Case") -> "Case":
-    """Return the case at the size of its scene's `[patient] scale`.
-
-    Raises:
-        InputError: the scene has [muscles], markers or [measured], which belong to the unscaled
-            subject.
-    """
+    """Return the case at the size of its scene's `[patient] scale`."""
     s = case.scene.patient.scale
     for content, table in (
         (case.scene.muscles, "[muscles]"),

@@ -28,9 +28,6 @@ def seated_motion(
         femoral: femoral component, femoral frame.
         insert: insert, insert frame.
         cutoff: cut-off frequency of the low-pass filter, Hz.
-
-    Raises:
-        InputError: the femur is not above the insert in some frame.
     """
     places = motion.coordinates.copy()
     lowest = LowestPoints(femoral, condyle_split(femoral))
@@ -69,9 +66,6 @@ def rolling_motion(
         insert: insert, insert frame.
         slip_share: share of the recorded motion's mean slip of the condyles; 0 is pure rolling.
         cutoff: cut-off frequency of the low-pass filter, Hz.
-
-    Raises:
-        InputError: the femur rolls off the insert.
     """
     split = condyle_split(femoral)
     recorded = condyle_slip(femoral, insert, split, motion.coordinates)

@@ -148,12 +148,7 @@ def muscle_tables(scene: Scene) -> tuple[MuscleTable, ...]:
 
 
 def read_muscles(scene: Scene, chain: Chain) -> "tuple[Muscle, ...]":
-    """Return the muscles.
-
-    Raises:
-        InputError: equilibrium cannot determine their forces (`tkamb.knee.muscles.check_muscles`),
-            or a bone's mesh cannot be read.
-    """
+    """Return the muscles."""
     from tkamb.knee.muscles import Muscle, check_muscles
 
     is_left = scene.patient.side == "left"
@@ -188,11 +183,7 @@ def read_patellar_ligament(scene: Scene) -> "PatellarLigament | None":
 
 
 def read_ligaments(scene: Scene, parts: ImplantParts, chain: Chain) -> "tuple[Ligament, ...]":
-    """Return the bundles of the [[ligament]] tables, then the bundles of [generic_ligaments].
-
-    Raises:
-        InputError: a collateral ligament is on the wrong side of the knee.
-    """
+    """Return the bundles of the [[ligament]] tables, then the bundles of [generic_ligaments]."""
     if not (scene.ligament or scene.generic_ligaments):
         return ()
     from tkamb.knee.ligaments import check_collateral_sides, generic_ligaments
@@ -217,12 +208,7 @@ def read_ligaments(scene: Scene, parts: ImplantParts, chain: Chain) -> "tuple[Li
 def read_patella_lines(
     scene: Scene, parts: ImplantParts, chain: Chain
 ) -> "tuple[tuple[HeadShare, ...], tuple[Ligament, ...]]":
-    """Return the heads of the quadriceps and the ligaments of a released patella.
-
-    Raises:
-        InputError: a head does not run from the femur to the patella, a ligament has no end or both
-            ends on the patella, or none runs to the tibia.
-    """
+    """Return the heads of the quadriceps and the ligaments of a released patella."""
     table, is_left = scene.patella, scene.patient.side == "left"
     if table is None or not table.released:
         return (), ()
@@ -285,11 +271,7 @@ def ligament(table: LigamentTable, left: bool = False) -> "Ligament":
 def wrap_object(
     table: LigamentWrapTable, parts: ImplantParts, chain: Chain, left: bool = False
 ) -> "WrapObject":
-    """Return the surface that a table describes, mirrored if `left`.
-
-    Raises:
-        InputError: an outline is not convex, or a component is missing or not cut by the section.
-    """
+    """Return the surface that a table describes, mirrored if `left`."""
     from scipy.spatial.transform import Rotation
 
     from tkamb.geometry.polygons import convex_outline
@@ -321,11 +303,7 @@ def wrap_object(
 
 
 def wrap_table(wrap: "WrapObject", left: bool = False) -> dict[str, Any]:
-    """Return the table that describes a surface, mirrored if `left`.
-
-    Raises:
-        InputError: a scene has no such shape.
-    """
+    """Return the table that describes a surface, mirrored if `left`."""
     from scipy.spatial.transform import Rotation
 
     if wrap.shape == "torus" or wrap.quadrant is not None:

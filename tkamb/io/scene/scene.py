@@ -202,9 +202,6 @@ def with_preset(scene: Scene, preset: str, overrides: dict[str, Any] | None = No
     Args:
         preset: name of a preset (`tkamb.io.presets`).
         overrides: dotted key -> value that replaces the preset's value.
-
-    Raises:
-        InputError: the preset does not exist, or the scene lacks data for it.
     """
     content = scene.model_dump(exclude_unset=True)
     more = scene.overrides | (overrides or {})
@@ -220,9 +217,6 @@ def with_overrides(scene: Scene, overrides: dict[str, Any]) -> Scene:
     Args:
         scene: the scene; its overrides and its preset stay.
         overrides: dotted key -> value; a relative path is relative to the working directory.
-
-    Raises:
-        InputError: a key is unknown, or a value is out of range.
     """
     result = _changed(scene.model_dump(exclude_unset=True), scene.overrides | overrides)
     result._preset = scene.preset

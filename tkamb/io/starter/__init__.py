@@ -22,9 +22,6 @@ def lay_out(directory: Path, person: "Person | None" = None) -> Path:
 
     Args:
         person: the patient; None: a man of 75 kg and 1.75 m, right knee.
-
-    Raises:
-        InputError: the folder is not empty, or cannot be written.
     """
     directory = Path(directory)
     try:

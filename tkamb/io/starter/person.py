@@ -65,9 +65,6 @@ class Person:
         mass: body mass, kg.
         height: body height, m.
         sex: "female" or "male", which selects the table of de Leva (1996).
-
-    Raises:
-        InputError: mass or height is outside the limits of `LegProportionSettings`.
     """
 
     side: Literal["left", "right"] = "right"

@@ -149,9 +149,6 @@ def knee_trial(
     Args:
         motion: coordinates of the OpenSim model over time.
         loads: name of a body -> external wrenches, (f, 6), as in `solve_trial`.
-
-    Raises:
-        InputError: no muscle ends on or passes the patella, or any error of `solve_trial`.
     """
     leg = links.leg
     problems, bones = trial_problems(leg, motion, loads, sharing)
@@ -176,11 +173,7 @@ def knee_trial(
 def _crossing_lines(
     links: Links, bones: Bones, extensor: np.ndarray
 ) -> tuple[np.ndarray, Array, Array]:
-    """Return the indices of the muscles across the knee, and their ends on shank and thigh.
-
-    Raises:
-        InputError: a muscle crosses the knee more than once.
-    """
+    """Return the indices of the muscles across the knee, and their ends on shank and thigh."""
     parts = bones.crossings
     below = np.isin(parts.bodies, [bones.index("tibia"), bones.index("foot")])
     above = np.isin(parts.bodies, [bones.index("femur"), -1])
@@ -245,9 +238,6 @@ def load_knee_trial(source: LegRecording, time: Array) -> tuple[Links, KneeTrial
 
     Args:
         time: times of the frames on the clock of the recordings, s, (f,).
-
-    Raises:
-        InputError: a file or an option cannot be used.
     """
     leg = _read_leg(source.model, source.side)
     links = find_links(leg, source.insert_placement, source.mesh_axes, {}, False)
@@ -264,11 +254,7 @@ def load_knee_trial(source: LegRecording, time: Array) -> tuple[Links, KneeTrial
 
 
 def group_names(model: Path, side: Side) -> tuple[str, ...]:
-    """Return the names of the muscle groups of a leg, see `muscle_groups`.
-
-    Raises:
-        InputError: the model cannot be used.
-    """
+    """Return the names of the muscle groups of a leg, see `muscle_groups`."""
     leg = _read_leg(model, side)
     return tuple(muscle_groups(leg, [leg.model.muscles[name] for name in leg_muscles(leg)]))
 

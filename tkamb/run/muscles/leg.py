@@ -124,9 +124,6 @@ def leg_coordinates(leg: Leg) -> tuple[str, ...]:
 
     They belong to hip, knee flexion, ankle and the joint below the ankle (subtalar). Locked and
     dependent coordinates are excluded.
-
-    Raises:
-        InputError: the knee has no flexion.
     """
     if leg.flexion is None:
         raise InputError(f"has a knee '{leg.knee.name}' without flexion", leg.model.name)
@@ -225,9 +222,6 @@ def check_extensors(leg: Leg, muscles: tuple[str, ...]) -> None:
 
     A patellar ligament then transmits their moment to the tibia. It is no muscle, so that the
     moment arm -dL/dq about the flexion is near zero.
-
-    Raises:
-        InputError: there are such muscles.
     """
     if leg.patella is None:
         return

@@ -218,11 +218,7 @@ def sharing_of(table: MusclesTable) -> Sharing:
 
 
 def load_muscles(case: Case) -> SharedMuscles:
-    """Return the muscles of a case with [muscles].
-
-    Raises:
-        InputError: a file cannot be used, or the model does not agree with the URDF.
-    """
+    """Return the muscles of a case with [muscles]."""
     scene, table = case.scene, case.scene.muscles
     assert table is not None
     ground, markers, insert = scene.ground_reaction, scene.motion.markers, scene.implant.insert
@@ -258,11 +254,7 @@ def load_muscles(case: Case) -> SharedMuscles:
 
 
 def groups_of(case: Case) -> tuple[str, ...]:
-    """Return the names of the muscle groups of a case with [muscles].
-
-    Raises:
-        InputError: the model cannot be used.
-    """
+    """Return the names of the muscle groups of a case with [muscles]."""
     table = case.scene.muscles
     assert table is not None
     return group_names(table.model, case.scene.patient.side)

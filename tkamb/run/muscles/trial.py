@@ -126,11 +126,7 @@ class Bones:
         return Attachments(points, directions)
 
     def index(self, name: str) -> int:
-        """Return the index of a bone.
-
-        Raises:
-            InputError: no such bone.
-        """
+        """Return the index of a bone."""
         if name not in self.names:
             raise InputError(f"no bone '{name}'", "muscles", names_near(name, self.names))
         return self.names.index(name)
@@ -263,9 +259,6 @@ def trial_problems(
     Args:
         motion: coordinates of the model over time.
         loads: name of a body -> external wrench, see `solve_trial`.
-
-    Raises:
-        InputError: no such muscle, coordinate or body, or an option is out of range.
     """
     model, kinematics = leg.model, Kinematics(leg.model)
     names = leg_muscles(leg) if sharing.muscles is None else sharing.muscles

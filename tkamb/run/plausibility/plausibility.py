@@ -49,9 +49,6 @@ class Plausibility:
 
     Attributes:
         questions: questions without an answer in the scene.
-
-    Raises:
-        InputError: an answer is empty, or belongs to no question.
     """
 
     def __init__(self, case: Case, recording: "Recording") -> None:

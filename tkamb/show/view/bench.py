@@ -139,11 +139,7 @@ class BenchRequest:
 
     @staticmethod
     def read(values: Mapping[str, Any]) -> "BenchRequest":
-        """Return the request of a JSON object from the page.
-
-        Raises:
-            InputError: a key is unknown, or a value is not a number or outside its range.
-        """
+        """Return the request of a JSON object from the page."""
         names = {one.name for one in fields(BenchRequest)}
         for key in values:
             if key not in names:

@@ -254,11 +254,7 @@ def _bundles(knee: Knee, tibia: Array) -> "list[Ligament]":
 
 
 def _contact_lines(knee: Knee) -> list[str]:
-    """Return [contact] and [material] of a knee.
-
-    Raises:
-        InputError: the contact model has no name, or a scene has no key for an option or a law.
-    """
+    """Return [contact] and [material] of a knee."""
     assert knee.contact is not None
     model: Any = knee.contact.model
     name = next((one for one in contact_names() if contact_class(one) is type(model)), None)

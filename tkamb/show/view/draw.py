@@ -111,9 +111,6 @@ def lattice_lines(case: Case) -> Array:
 
     The cells have the scene's resolution, for any contact model. The result is empty without
     contact.
-
-    Raises:
-        InputError: the insert cannot be meshed.
     """
     if case.scene.contact is None or case.insert is None:
         return np.empty((0, 2, 3))

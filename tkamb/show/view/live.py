@@ -135,9 +135,6 @@ class LiveKnee:
 
     Attributes:
         design: design of the insert; None if its mesh does not come from a parametric design.
-
-    Raises:
-        InputError: the scene has no [contact], or is scaled.
     """
 
     def __init__(self, case: Case, session: Path | None = None) -> None:
@@ -199,9 +196,6 @@ class LiveKnee:
         A new thread prepares the model, because a lattice takes seconds. Requests for other models
         are computed meanwhile. If `most_threads` threads run already, no thread is started. The
         page repeats its request until the model is ready.
-
-        Raises:
-            InputError: the model cannot be prepared.
         """
         key = setting(request)
         with self._counting:
@@ -259,9 +253,6 @@ class LiveKnee:
 
         Args:
             folder: new or empty folder.
-
-        Raises:
-            InputError: the folder is not empty, or cannot be written.
         """
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise InputError("exists already and is not empty", folder, "give a new folder")
@@ -283,11 +274,7 @@ class LiveKnee:
         return self.bench.case_of(request, height, self._case_with(request.thickness_mm))
 
     def _case_with(self, thickness_mm: float | None) -> Case:
-        """Return the case with an insert of another thickness.
-
-        Raises:
-            InputError: the insert's design is not parametric.
-        """
+        """Return the case with an insert of another thickness."""
         if thickness_mm is None or (self.design and thickness_mm == self.design.thickness):
             return self.case
         if self.design is None:

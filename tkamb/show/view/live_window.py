@@ -63,9 +63,6 @@ class LiveWindow:
     Args:
         folder: folder for saved scenes, which are called kept-1, kept-2 and so on.
         frame: recorded frame at which the window opens.
-
-    Raises:
-        InputError: the motion has no such frame.
     """
 
     def __init__(self, knee: LiveKnee, folder: Path, frame: int = 0) -> None:
@@ -78,11 +75,7 @@ class LiveWindow:
         self.start = replace(self.start, resolution_mm=resolution_mm)
 
     def server(self, port: int = 0) -> ViewServer:
-        """Return the server of the window, not yet started.
-
-        Raises:
-            InputError: the port is taken.
-        """
+        """Return the server of the window, not yet started."""
         return ViewServer(self.page(), pack([self._drawing()]), None, port, self.question)
 
     def question(self, name: str, content: dict[str, Any]) -> bytes:
@@ -265,9 +258,6 @@ def open_live(
         frame: recorded frame at which the window opens.
         contact: contact model that replaces the scene's.
         folder: folder for saved scenes; None: out/live.
-
-    Raises:
-        InputError: the path has no scene, or the scene has no [contact].
     """
     from tkamb.show.view.run import read_source
 
@@ -339,10 +329,6 @@ def bench_of_knee(knee: Knee, q: Any) -> LiveKnee:
 
     Args:
         q: configuration (nq,), or configurations (f, nq) for the slider "recorded frame".
-
-    Raises:
-        InputError: the knee has no contact model or one without a name, q has another size, or a
-            scene does not accept a part of the knee.
     """
     if knee.contact is None or knee.femoral is None or knee.insert is None:
         raise InputError("has no contact model", "Knee", "give contact= and implant=")

@@ -45,9 +45,6 @@ def check_film(path: Path, option: str) -> None:
 
     Args:
         path: path of the film, .gif or .mp4.
-
-    Raises:
-        InputError: the suffix is another one, or a browser or a package of the extra is missing.
     """
     if path.suffix.lower() != f".{option.removeprefix('--')}":
         raise InputError(f"'{path.name}' does not end with .{option.removeprefix('--')}", option)

@@ -105,9 +105,6 @@ class Source:
         Args:
             progress: function that wraps the frame indices, for example a progress bar.
             announce: function that prints a line for the user.
-
-        Raises:
-            InputError: the scene cannot be run, or has changed since the run.
         """
         if self.kept is not None:
             announce(f"results of this scene found in {self.kept}")
@@ -126,9 +123,6 @@ def read_source(path: str | Path, contact: str | None = None) -> Source:
     Args:
         path: a folder that `tkamb run` wrote, or a scene file.
         contact: contact model that replaces the scene's; only for a scene file.
-
-    Raises:
-        InputError: the path has nothing to show, or the scene has changed since the run.
     """
     path = Path(path)
     if os.path.isdir(path):
@@ -156,11 +150,7 @@ def open_run(
     contact: str | None = None,
     announce: Callable[[str], None] = lambda line: None,
 ) -> CaseResults:
-    """Return the run of a results folder or a scene file; see `read_source` and `Source`.
-
-    Raises:
-        InputError: the path has nothing to show, or the scene has changed since the run.
-    """
+    """Return the run of a results folder or a scene file; see `read_source` and `Source`."""
     return read_source(path, contact).open(announce=announce)
 
 
@@ -169,9 +159,6 @@ def check_frame(sources: Sequence[Source], frame: int) -> None:
 
     Args:
         frame: row of the results; negative ones count from the end.
-
-    Raises:
-        InputError: no run has the frame.
     """
     most = max(map(len, sources))
     if not -most <= frame < most:
@@ -184,11 +171,7 @@ def no_frame(frame: int, most: int) -> InputError:
 
 
 def match_frames(case: Case, results: Results) -> CaseResults:
-    """Return the run of a case and its results, with the frames matched by time.
-
-    Raises:
-        InputError: the results have times that the motion does not have.
-    """
+    """Return the run of a case and its results, with the frames matched by time."""
     frame_at = {float(time): k for k, time in enumerate(case.motion.time)}
     try:
         frames = tuple(frame_at[float(time)] for time in results["time_s"])
@@ -200,9 +183,5 @@ def match_frames(case: Case, results: Results) -> CaseResults:
 
 
 def run_of_results(results: Results) -> CaseResults:
-    """Return the run of results. The scene is read from the path in their summary.
-
-    Raises:
-        InputError: the scene is missing, or has changed since the run.
-    """
+    """Return the run of results. The scene is read from the path in their summary."""
     return match_frames(case_of_results(results), results)

@@ -169,9 +169,6 @@ class ViewServer:
         port: port of the server; 0: any free port.
         bench: function that returns the answer to a request of `tkamb live` from its name and
             content; None: the page is not that of `tkamb live`.
-
-    Raises:
-        InputError: the port is taken.
     """
 
     def __init__(

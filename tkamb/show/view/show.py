@@ -34,9 +34,6 @@ class Show:
         lattice: whether the cells of the lattice are drawn too. The live window draws them when
             the user switches their layer on.
         progress: function that wraps the frame indices, for example a progress bar.
-
-    Raises:
-        InputError: no run has the frame, or the camera does not exist.
     """
 
     def __init__(
@@ -55,11 +52,7 @@ class Show:
         self.title = " | ".join(drawing.title for drawing in self.drawings)
 
     def at(self, frame: int, camera: str) -> "Show":
-        """Return the same drawings with another first frame and camera.
-
-        Raises:
-            InputError: no run has the frame, or the camera does not exist.
-        """
+        """Return the same drawings with another first frame and camera."""
         other = copy(self)
         other.frame, other.camera = self._check(frame, camera)
         return other
@@ -69,11 +62,7 @@ class Show:
         return page_html(self.title, self.packed, frame=self.frame, view=self.camera)
 
     def write_html(self, path: str | Path) -> None:
-        """Write the self-contained page.
-
-        Raises:
-            InputError: the folder cannot be written.
-        """
+        """Write the self-contained page."""
         write_text(Path(path), self.html())
 
     def write_png(self, path: str | Path, size: tuple[int, int] = (1400, 900)) -> None:
@@ -102,11 +91,7 @@ class Show:
         return frame % most, camera
 
     def server(self, port: int = 0) -> "ViewServer":
-        """Return the server of the live window, not yet started.
-
-        Raises:
-            InputError: the port is taken.
-        """
+        """Return the server of the live window, not yet started."""
         from tkamb.show.view.server import ContactSwitch, ViewServer
 
         switch = ContactSwitch(self.runs[0], peak_pressure(self.drawings))
@@ -114,11 +99,7 @@ class Show:
         return ViewServer(html, self.packed, switch, port)
 
     def open(self, announce: Line, port: int = 0, browse: bool = True) -> None:
-        """Serve the live window until the user interrupts.
-
-        Raises:
-            InputError: the port is taken.
-        """
+        """Serve the live window until the user interrupts."""
         server = self.server(port)
         announce(f"viewer: {server.url} (this machine only; Ctrl-C ends it)")
         if browse and not open_window(server.url):

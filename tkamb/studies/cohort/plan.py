@@ -230,11 +230,7 @@ class Cohort:
 
 
 def load_cohort(path: str | Path, frames: str | None = None) -> Cohort:
-    """Read a cohort file and the scene of every run. Meshes and recordings are not opened.
-
-    Raises:
-        InputError: the file or a scene cannot be used.
-    """
+    """Read a cohort file and the scene of every run. Meshes and recordings are not opened."""
     path = Path(path)
     content = read_toml(path, what="cohort file")
     if frames is not None:

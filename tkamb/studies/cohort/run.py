@@ -49,11 +49,7 @@ def write_cohort(
     folder: Path,
     report: Report | None = None,
 ) -> None:
-    """Write cohort.parquet, runs.csv, groups.csv, cohort.json and a cohort.html, all or none.
-
-    Raises:
-        InputError: the folder cannot be written.
-    """
+    """Write cohort.parquet, runs.csv, groups.csv, cohort.json and a cohort.html, all or none."""
     groups = groups_of(cohort, outcomes)
     runs = run_rows(cohort, outcomes)
     with replaced_together(folder) as files:
@@ -172,9 +168,6 @@ class Part:
 
     Args:
         index: number of the part, from 1 to `count`.
-
-    Raises:
-        InputError: the numbers are out of range.
     """
 
     index: int

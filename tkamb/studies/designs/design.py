@@ -154,11 +154,7 @@ class Design:
 
 
 def load_design(folder: str | Path) -> Design:
-    """Read design.toml of a folder.
-
-    Raises:
-        InputError: the file is missing, a key is unknown or lacks its unit, or a value is invalid.
-    """
+    """Read design.toml of a folder."""
     file = Path(folder) / DESIGN_FILE
     rows = read_toml(file, what="design file")
     unknown = set(rows) - {"title", "bearing", "femoral", "cam", "insert", "post", "sources"}

@@ -63,9 +63,6 @@ def joined(cam: Cam, box_half: float, vertices: Array, faces: Ids) -> tuple[Arra
         box_half: half the width of the box, mm. Its walls are the planes z = ±box_half.
         vertices: vertices of the component without the cam, mm, shape (n, 3).
         faces: faces of the component without the cam, shape (k, 3).
-
-    Raises:
-        InputError: the walls have no area where the cam can be joined.
     """
     cam_direction = np.arctan2(-cam.centre_ap, -cam.centre_si)
     angle = np.degrees(np.arctan2(-vertices[:, 0], -vertices[:, 1]) - cam_direction)
@@ -143,9 +140,6 @@ class SagittalProfile:
     Args:
         arcs: rows (from deg, to deg, radius mm); each arc starts at the end of the preceding one.
         origin: anterior and superior position of the first arc's centre, mm.
-
-    Raises:
-        InputError: the arcs have a gap, run backwards or have a radius that is not positive.
     """
 
     def __init__(self, arcs: ArrayLike, origin: Sequence[float] = (0.0, 0.0)) -> None:
@@ -327,11 +321,7 @@ class FemoralComponent:
         )
 
     def mesh_with_cam(self) -> tuple[Array, NDArray[np.int64]]:
-        """Return the closed triangulation of `mesh` with the cam across its box.
-
-        Raises:
-            InputError: the component has no cam, or it cannot be joined to the walls of the box.
-        """
+        """Return the closed triangulation of `mesh` with the cam across its box."""
         if self.cam is None:
             raise InputError("the femoral component has no cam", "[cam]", "give its dimensions")
         return joined(self.cam, self.notch_half, *self.mesh())

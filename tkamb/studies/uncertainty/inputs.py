@@ -60,9 +60,6 @@ def varied_inputs(case: Case) -> tuple[VariedInput, ...]:
     """Return the inputs of a case that have a standard deviation above 0.
 
     Pose coordinates come first, in the order of `KNEE_COORDINATES`.
-
-    Raises:
-        InputError: every standard deviation is 0.
     """
     inputs = tuple(varied for varied in _all_inputs(case) if varied.deviation > 0)
     if not inputs:
@@ -262,12 +259,7 @@ ROUNDING = 1e-10
 
 
 def correlation_root(tables: Sequence[CorrelationTable], names: Sequence[str]) -> Array:
-    """Return the Cholesky factor L (d, d) of the correlation matrix of the inputs.
-
-    Raises:
-        InputError: an input does not vary, a pair occurs twice, or the coefficients contradict
-            each other.
-    """
+    """Return the Cholesky factor L (d, d) of the correlation matrix of the inputs."""
     matrix = np.eye(len(names))
     for table in tables:
         row, column = (_index(name, names) for name in table.between)
@@ -375,9 +367,6 @@ def normal_samples(method: str, count: int, dimensions: int, seed: int) -> Array
         method: sampling method, "lhs" or "sobol".
         count: number of samples, at least 1.
         seed: seed of the random numbers.
-
-    Raises:
-        InputError: the method is unknown, or the number of samples is below 1.
     """
     if count < 1:
         raise InputError(f"{count} is not a number of samples", "samples", "give at least 1")

@@ -61,11 +61,7 @@ from tkamb.studies.uncertainty.sensitivity import SobolIndex, sobol_indices
 def write_uncertainty(
     uncertainty: "Uncertainty", folder: Path, report: Callable[[Results], str] | None = None
 ) -> None:
-    """Write nominal results, bands, tornado table, samples and indices together.
-
-    Raises:
-        InputError: the folder cannot be written.
-    """
+    """Write nominal results, bands, tornado table, samples and indices together."""
 
     def write_samples(path: Path) -> None:
         with new_hdf5(path) as file:

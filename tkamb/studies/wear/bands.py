@@ -60,9 +60,6 @@ def varied_wear_inputs(
         creep: creep law; None: creep is not modelled.
         profile: whether the motion is a simulator's profile. Its pose then varies only by stated
             deviations, because the defaults are those of recorded poses.
-
-    Raises:
-        InputError: every standard deviation is 0.
     """
     in_equilibrium = () if motion.drive is None else motion.drive.names
     if not profile:
@@ -326,11 +323,7 @@ def _bands(
 
 
 def check_samples(samples: int) -> None:
-    """Check the number of samples of a wear simulation; 0: no bands.
-
-    Raises:
-        InputError: the number is out of range.
-    """
+    """Check the number of samples of a wear simulation; 0: no bands."""
     if samples and not MIN_SAMPLES <= samples <= WEAR_BAND.max_samples:
         raise InputError(
             f"cannot be {samples}",

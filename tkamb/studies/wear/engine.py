@@ -254,9 +254,6 @@ class ContactEngine:
         Args:
             insert: insert in the insert frame.
             rotation: orientation of the femoral component, shape (3, 3).
-
-        Raises:
-            InputError: the femoral component is not above the insert at any initial guess.
         """
         pair = ContactPair(self.femoral, insert, self.material, self.bearing)
 

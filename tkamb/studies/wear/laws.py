@@ -215,11 +215,7 @@ class ContactArea(WearLaw):
 
 
 def check_factor(value: Any, where: str, unit: str = "mm³/(N m)") -> float:
-    """Return a wear factor or coefficient after a check; `unit` is named in the message.
-
-    Raises:
-        InputError: the value is negative, not finite, or above `WEAR_LAW.max_wear_factor`.
-    """
+    """Return a wear factor or coefficient after a check; `unit` is named in the message."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if not (number and math.isfinite(value) and 0 <= value <= WEAR_LAW.max_wear_factor):
         hint = f"give a number from 0 to {WEAR_LAW.max_wear_factor:g} in {unit}"
@@ -282,12 +278,7 @@ def law_names() -> tuple[str, ...]:
 
 
 def law_class(name: str) -> type[WearLaw]:
-    """Return the class of a wear law.
-
-    Raises:
-        InputError: the name is unknown or ambiguous, or the class cannot be loaded or is not a
-            wear law.
-    """
+    """Return the class of a wear law."""
     return WEAR_LAWS.find(name)
 
 
@@ -297,9 +288,6 @@ def wear_law(name: str, parameters: Mapping[str, Any], where: object = None) -> 
     Args:
         name: name of the law, one of `law_names()`.
         parameters: parameter -> value, for all parameters of the law.
-
-    Raises:
-        InputError: the law is unknown, a parameter is missing or unknown, or a value is invalid.
     """
     result = law_class(name)
     names = [field.name for field in fields(result)]  # type: ignore[arg-type]
@@ -421,10 +409,6 @@ class WearMaterial:
         Args:
             name: name of the law; None: the default law of the material.
             wear_factor: wear factor that replaces the one of the material, mm³/(N m).
-
-        Raises:
-            InputError: the law is unknown, the material has no parameters for it, or a wear factor
-                is given for a law that does not have exactly one.
         """
         name = name or self.law
         parameters = dict(self.laws.get(name, {}))
@@ -452,11 +436,7 @@ def material_names() -> tuple[str, ...]:
 
 
 def wear_material(name: str | Path) -> WearMaterial:
-    """Return a built-in wear material, or the material of a TOML file.
-
-    Raises:
-        InputError: the name or file does not exist, a key is unknown, or a value is invalid.
-    """
+    """Return a built-in wear material, or the material of a TOML file."""
     built_in = _built_in()
     if str(name) in built_in:
         return _material(str(name), built_in[str(name)], f"wear material '{name}'")

@@ -110,9 +110,6 @@ class CycleMotion:
             interval: duration of the screw motion, s; None: the mean interval between the frames.
             track: times, s, shape (g,), and poses, shape (g, 4, 4), of the whole recording;
                 None: only the poses of the frames are known.
-
-        Raises:
-            InputError: fewer than two frames have a contact, or the closing is unknown.
         """
         check_closing(closing)
         finite = np.isfinite(load) & np.isfinite(poses).all(axis=(1, 2))

@@ -280,11 +280,7 @@ class WearReport:
         return [f"force control: {', '.join(ranges)}; {len(self.last.failed)} rows failed"]
 
     def write(self, folder: Path) -> None:
-        """Write wear.csv, wear.json, wear.vtp, worn_insert.stl and wear.png, all or none.
-
-        Raises:
-            InputError: the folder cannot be written.
-        """
+        """Write wear.csv, wear.json, wear.vtp, worn_insert.stl and wear.png, all or none."""
 
         surface, maps = self._worn(), self._maps()
         with replaced_together(folder) as files:

@@ -59,11 +59,7 @@ def wear_identity(setup: WearSetup, case: WearCase, cycles: int, updates: int) -
 
 
 def keep_state(folder: Path, state: WearState, identity: str) -> None:
-    """Store the state in the folder. An interruption leaves the earlier state in place.
-
-    Raises:
-        InputError: the folder cannot be written.
-    """
+    """Store the state in the folder. An interruption leaves the earlier state in place."""
     arrays = {f.name: np.asarray(getattr(state, f.name)) for f in fields(state) if f.name != "rows"}
     rows = np.asarray(json.dumps(state.rows))
     with replaced_file(folder / STATE_NAME) as temporary, open(temporary, "wb") as file:
@@ -71,11 +67,7 @@ def keep_state(folder: Path, state: WearState, identity: str) -> None:
 
 
 def kept_state(folder: Path, identity: str) -> WearState | None:
-    """Return the state that is stored in a folder; None if there is none.
-
-    Raises:
-        InputError: the state belongs to another simulation, or is damaged.
-    """
+    """Return the state that is stored in a folder; None if there is none."""
     path = folder / STATE_NAME
     if not path.is_file():
         return None
@@ -234,9 +226,6 @@ def prepare_wear(
         samples: number of samples for bands, at least 20; 0: no bands; None: 32 if the scene has
             [uncertainty].
         period: duration of a simulator's cycle, s.
-
-    Raises:
-        InputError: an argument or the scene is invalid.
     """
     check_blocks(cycles, updates)
     check_samples(samples or 0)
@@ -264,9 +253,6 @@ def wear_of_results(
     Args:
         updates: number of updates of the insert's geometry.
         frames: largest number of frames of a cycle.
-
-    Raises:
-        InputError: an argument, the scene or the results are invalid.
     """
     check_blocks(cycles, updates)
     choice = _MaterialChoice(None, None, None)

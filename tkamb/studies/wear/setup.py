@@ -96,9 +96,6 @@ def wear_setup(
             [wear], because other keys need another run.
         check: function of [wear] and the path of the scene that is called before frames are run.
         progress: wrapper of the iterator of the frames to run.
-
-    Raises:
-        InputError: the scene, folder or profile is invalid, has no contact, or has a post.
     """
     if frames < 2:
         raise InputError(f"{frames} frames", "--frames-per-cycle", "give at least 2")
@@ -158,9 +155,6 @@ def setup_of_results(scene: Scene, path: Path, results: Results, frames: int) ->
 
     Args:
         frames: largest number of frames of a cycle.
-
-    Raises:
-        InputError: there is no contact, or there is contact with a post.
     """
     case, table = load_case(scene), scene.contact
     if table is None or results.maps is None or case.insert is None:

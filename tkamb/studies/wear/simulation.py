@@ -181,10 +181,6 @@ def simulate_wear(
         state: state of an earlier simulation of the case, to resume it; None: unworn.
         keep: function that is called with the state after each block.
         most_change: share of the worn volume per cycle, from 0 to 1. 1: never repeat a block.
-
-    Raises:
-        InputError: a number is out of range, or there is no contact before the first block or after
-            its shortest length.
     """
     check_blocks(cycles, updates)
     state = state or WearState.unworn(len(case.articular.vertices), cycles / updates)

@@ -72,11 +72,7 @@ class Springs:
 
 
 def read_springs(path: str | Path) -> Springs:
-    """Read a TOML file of springs: `sources`, and [ap], [axial_rotation] or both.
-
-    Raises:
-        InputError: a key is unknown or missing, or a value is invalid.
-    """
+    """Read a TOML file of springs: `sources`, and [ap], [axial_rotation] or both."""
     content = read_toml(path, what="springs")
     sources = content.pop("sources", None)
     if not (isinstance(sources, list) and sources and all(isinstance(s, str) for s in sources)):
@@ -337,9 +333,6 @@ class Profile:
         """Return the loads of force control for a dwell position (x, z), m.
 
         Returns None with displacement control.
-
-        Raises:
-            InputError: a spring acts on a coordinate without force or torque.
         """
         names = [KNEE_COORDINATES[i] for i in self.free]
         for name in springs.springs if springs else ():
@@ -373,10 +366,6 @@ def read_profile(path: str | Path, frames: int) -> Profile:
 
     Args:
         frames: smallest number of frames of a cycle, at least 2.
-
-    Raises:
-        InputError: a column is missing or unknown, a displacement and its force are both given, a
-            value is invalid, the cycle does not close, or force control lacks axial force.
     """
     table = read_table(Path(path), "csv")
     names = (PERCENT, LOAD, *COORDINATES, *FORCES)

@@ -60,11 +60,7 @@ class ArticularSurface:
 
     @classmethod
     def of_insert(cls, insert: Surface, spacing: float) -> "ArticularSurface":
-        """Return the articular surface of an insert, with edges of at most `spacing`, m.
-
-        Raises:
-            InputError: no face of the insert faces upwards.
-        """
+        """Return the articular surface of an insert, with edges of at most `spacing`, m."""
         merged = insert.mesh.copy()
         merged.merge_vertices()
         finer = refined(
