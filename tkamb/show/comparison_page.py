@@ -221,7 +221,7 @@ def headline(comparison: Comparison) -> list[Difference]:
 
 
 def check_frame(comparison: Comparison, frame: int | None) -> int:
-    """Return the frame of the first run at which maps are shown; negative ones count from the end."""
+    """Return the frame of the first run with shown maps; negative ones count from the end."""
     count = len(comparison.runs[0].results)
     if frame is None:
         return shown_frame(comparison)

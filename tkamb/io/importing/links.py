@@ -204,7 +204,7 @@ def find_links(
 def _anatomical(
     leg: Leg, frame: MeshFrame, body: str, turn: Array, part: str, remarks: list[str]
 ) -> Array:
-    """Return the pose (4, 4) of a part in a body, with the part's frame turned to anatomical axes."""
+    """Return the pose (4, 4) in a body of a part, turned to anatomical axes."""
     assert frame.pose is not None
     pose = leg.in_body(frame.body, body) @ frame.pose @ inverse(turn)
     nearest, _ = quarter_turn(pose[:3, :3])

@@ -109,7 +109,7 @@ class Kinematics:
         self._signed_gradients = self._signs[:, None] * self._gradients
 
     def vector(self, q: Mapping[str, float] | ArrayLike) -> Array:
-        """Return coordinates (..., n). Coordinates that are not in a mapping have default values."""
+        """Return coordinates (..., n). Those that are not in a mapping have default values."""
         if isinstance(q, Mapping):
             values = np.array([c.default for c in self.model.coordinates.values()])
             for name, value in q.items():
