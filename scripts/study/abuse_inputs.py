@@ -14,8 +14,6 @@ import tomllib
 from functools import cache
 from pathlib import Path
 
-from forged_folders import forge
-
 MODEL = Path(__file__).resolve().parents[2] / "models" / "deep_knee_bend"
 MESHES = ("femoral_component.stl", "insert.stl")
 TABLES = ("motion.csv", "tibia.csv", "ground_reaction.csv")
@@ -218,26 +216,6 @@ def folders(folder: Path, chance: random.Random) -> list[str]:
     )
 
 
-def forged(folder: Path, chance: random.Random) -> list[str]:
-    """Write a forged folder of results, with correct hashes of wrong content."""
-    results = Path(os.environ["TKAMB_ABUSE_RESULTS"])
-    out = str(forge(folder, results, chance))
-    made = str(folder / "made")
-    return chance.choice(
-        [
-            ["verify", out],
-            ["report", out],
-            ["methods", out],
-            ["export", out, "--vtp", "--out", made],
-            ["export", out, "--sto", str(folder / "made.sto")],
-            ["export", out, "--deck", "ccx", "--frame", "0", "--out", str(folder / "made.inp")],
-            ["compare", str(results), out, "--out", made],
-            ["view", out, "--html", str(folder / "v.html")],
-            ["wear", out, "--cycles", "1", "--updates", "1", "--out", made],
-        ]
-    )
-
-
 def toml(folder: Path, chance: random.Random) -> list[str]:
     """Write a short TOML text that is expensive to read: scene, material, springs or --set."""
     count = chance.choice([100, 5_000, 200_000, 2_000_000])
@@ -414,7 +392,7 @@ def reworded(content: bytes, chance: random.Random) -> bytes:
 KINDS = {
     kind.__name__: kind
     for kind in (
-        arguments, odd_files, scenes, tables, urdfs, meshes, folders, forged, toml, opensim, options
+        arguments, odd_files, scenes, tables, urdfs, meshes, folders, toml, opensim, options
     )
 }  # fmt: skip
 
