@@ -360,9 +360,11 @@ def write_synced(path: Path, text: str) -> None:
 
 
 def write_rows(path: Path, rows: Iterable[Iterable[object]]) -> None:
-    """Write rows of cells as CSV, one after the other, and flush them to the disk."""
+    """Write rows of cells as CSV, one after the other, and flush them to the disk. NaN is empty."""
     with open(path, "w", encoding="utf-8", errors="backslashreplace", newline="") as file:
-        csv.writer(file, lineterminator="\n").writerows(rows)
+        csv.writer(file, lineterminator="\n").writerows(
+            ["" if cell != cell else cell for cell in row] for row in rows
+        )
         file.flush()
         os.fsync(file.fileno())
 

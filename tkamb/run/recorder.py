@@ -18,7 +18,7 @@ import shutil
 import signal
 import threading
 import time as clock
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,6 +37,7 @@ from tkamb.files import (
 )
 from tkamb.geometry.frames import Array
 from tkamb.io.claim import settle
+from tkamb.run.guard import interrupt_as_such
 from tkamb.run.recording import BUTTON, CONTACT_PLACES
 from tkamb.run.results_folder import (
     BUTTON_NAME,
@@ -164,6 +165,49 @@ class Shards:
             return None
         with undamaged(path, "leave out resume=True to begin again"):
             return dict(read_json(path))
+
+
+def stored(
+    folders: Sequence[Shards], numbers: Iterable[int], make: Callable[[Shard], T]
+) -> dict[int, T]:
+    """Return number -> object of each job that an earlier run finished."""
+    numbers, result = list(numbers), dict[int, T]()
+    for shards in folders:
+        for number in numbers if shards.resumed else ():
+            if (one := shards.read(number, make)) is not None:
+                result[number] = one
+    return result
+
+
+def completed(
+    done: dict[int, T],
+    answers: Iterable[tuple[int, T]],
+    keep: Callable[[int, T], None] | None,
+    total: str,
+) -> dict[int, T]:
+    """Return the stored and the new answers of all jobs.
+
+    Args:
+        done: number of a job -> stored answer.
+        answers: numbers and answers of the other jobs.
+        keep: function that stores an answer; None: answers are not stored.
+        total: number and name of all jobs, like "256 samples".
+
+    Raises:
+        KeyboardInterrupt: interrupted; the message states how many answers are stored.
+    """
+    try:
+        with interrupt_as_such():
+            for number, answer in answers:
+                if keep is not None:
+                    keep(number, answer)
+                done[number] = answer
+    except KeyboardInterrupt:
+        if keep is None or not done:
+            raise
+        words = f"{len(done)} of {total} are kept; go on with resume=True"
+        raise KeyboardInterrupt(words) from None
+    return done
 
 
 def check_same_run(

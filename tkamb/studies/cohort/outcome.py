@@ -353,7 +353,7 @@ def _means(values: Array, index: Array, count: int) -> Array:
     return np.divide(total, number, out=np.full(count, np.nan), where=number > 0)
 
 
-def group_rows(groups: Sequence[Group], group_by: Sequence[str]) -> list[list[str]]:
+def group_rows(groups: Sequence[Group], group_by: Sequence[str]) -> list[list[Any]]:
     """Return the rows of groups.csv: the header, then bins, peaks and wear of each group."""
     head = [*group_by, "axis", "from", "to", "column", "runs", "mean", "sd", "min", "max"]
     rows = [head]
@@ -373,7 +373,6 @@ def group_rows(groups: Sequence[Group], group_by: Sequence[str]) -> list[list[st
     return rows
 
 
-def _cells(statistics: Spread, index: int) -> list[str]:
+def _cells(statistics: Spread, index: int) -> list[Any]:
     numbers = (statistics.mean, statistics.sd, statistics.low, statistics.high)
-    texts = ["" if np.isnan(values[index]) else repr(float(values[index])) for values in numbers]
-    return [str(int(statistics.runs[index])), *texts]
+    return [int(statistics.runs[index]), *(values[index] for values in numbers)]

@@ -21,9 +21,8 @@ from tkamb.errors import InputError, not_installed
 from tkamb.files import replaced_together, sha256_of, write_rows, write_synced
 from tkamb.io.claim import claimed_directory, is_ours
 from tkamb.run.columns import ordered_names
-from tkamb.run.guard import interrupt_as_such
 from tkamb.run.identity import CONTACT_CODE, contact_code
-from tkamb.run.recorder import Shards
+from tkamb.run.recorder import Shards, completed, stored
 from tkamb.run.results_folder import remove_shards
 from tkamb.run.workers import PoolOptions, Progress, Task
 from tkamb.studies.cohort.outcome import CohortWorker, Group, Outcome, group_rows, groups_of
@@ -236,18 +235,16 @@ def run_cohort(
         shards = Shards(folder, identity, resume)
         part_shards = [Shards(part_folder, identity, True) for part_folder in parts]
         numbers = [run.number for run in cohort.runs if part is None or part.holds(run.number)]
-        outcomes = _stored([shards, *part_shards], numbers)
+        outcomes = stored([shards, *part_shards], numbers, Outcome.of)
         remaining = [(n, cohort.runs[n]) for n in numbers if n not in outcomes]
         task = Task(CohortWorker, (cohort.frames, cohort.table.map_flexion_deg, cohort.table.wear))
-        answers = crew.answers(task, remaining)
-        try:
-            with interrupt_as_such():
-                for number, outcome in progress(answers, len(remaining)):
-                    shards.put(number, outcome.shard())
-                    outcomes[number] = outcome
-        except KeyboardInterrupt:
-            words = f"{len(outcomes)} of {len(numbers)} runs are kept; go on with resume=True"
-            raise KeyboardInterrupt(words) from None
+        answers = progress(crew.answers(task, remaining), len(remaining))
+        completed(
+            outcomes,
+            answers,
+            lambda number, outcome: shards.put(number, outcome.shard()),
+            f"{len(numbers)} runs",
+        )
         outcomes = {number: outcomes[number] for number in numbers}
         if part is None:
             write_cohort(cohort, outcomes, identity, folder, report)
@@ -279,13 +276,3 @@ def _holds_parts_alone(directory: Path) -> bool:
     entries = list(directory.iterdir()) if os.path.isdir(directory) else []
     named = all(entry.match(SHARD_NAME.format("*", "*")) for entry in entries)
     return bool(entries) and named and all(is_ours(entry) for entry in entries)
-
-
-def _stored(folders: list[Shards], numbers: list[int]) -> dict[int, Outcome]:
-    result: dict[int, Outcome] = {}
-    for shards in folders:
-        for number in numbers if shards.resumed else ():
-            outcome = shards.read(number, Outcome.of)
-            if outcome is not None:
-                result[number] = outcome
-    return result

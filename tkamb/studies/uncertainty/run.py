@@ -22,8 +22,7 @@ from tkamb.io.scene import Scene, load_scene
 from tkamb.io.scene.case import Case, load_case
 from tkamb.run.claims import peaks
 from tkamb.run.columns import KINDS
-from tkamb.run.guard import interrupt_as_such
-from tkamb.run.recorder import Shard, Shards
+from tkamb.run.recorder import Shard, Shards, completed, stored
 from tkamb.run.results import MIN_SAMPLES, Results
 from tkamb.run.results_folder import (
     BANDS_NAME,
@@ -88,34 +87,30 @@ def write_uncertainty(
     write_results(uncertainty.results, folder, more=more, report=report)
 
 
-def _band_rows(columns: Mapping[str, Any]) -> list[Sequence[str]]:
-    rows = zip(*(map(_cell, values) for values in columns.values()), strict=True)
+def _band_rows(columns: Mapping[str, Any]) -> list[Sequence[object]]:
+    rows = zip(*columns.values(), strict=True)
     return [list(columns), *rows]
 
 
-def _tornado_rows(uncertainty: "Uncertainty") -> list[Sequence[str]]:
+def _tornado_rows(uncertainty: "Uncertainty") -> list[Sequence[object]]:
     by_name = {varied.name: varied for varied in uncertainty.inputs}
-    rows: list[Sequence[str]] = [
+    rows: list[Sequence[object]] = [
         ("result", "input", "standard_deviation", "unit", "variance_share", "change_per_sd")
     ]
     for row in uncertainty.tornado:
         varied = by_name.get(row.name)
-        deviation, unit = (_cell(varied.deviation), varied.unit) if varied else ("", "")
-        rows.append((row.result, row.name, deviation, unit, _cell(row.share), _cell(row.change)))
+        deviation, unit = (varied.deviation, varied.unit) if varied else ("", "")
+        rows.append((row.result, row.name, deviation, unit, row.share, row.change))
     return rows
 
 
-def _index_rows(indices: "Sequence[SobolIndex]") -> list[Sequence[str]]:
+def _index_rows(indices: "Sequence[SobolIndex]") -> list[Sequence[object]]:
     head = ("result", "input", "first_order", "first_order_se", "total", "total_se", "rows")
-    rows: list[Sequence[str]] = [head]
+    rows: list[Sequence[object]] = [head]
     for index in indices:
         numbers = (index.first, index.first_error, index.total, index.total_error)
-        rows.append((index.result, index.name, *map(_cell, numbers), str(index.rows)))
+        rows.append((index.result, index.name, *numbers, index.rows))
     return rows
-
-
-def _cell(value: float) -> str:
-    return "" if np.isnan(value) else repr(float(value))
 
 
 SAMPLES = 256
@@ -279,20 +274,17 @@ class _Job:
     def run(self, shards: Shards | None) -> Uncertainty:
         names = banded_names(self.nominal)
         count = len(self.points)
-        samples = _stored(shards, count)
+        folders = [] if shards is None else [shards]
+        samples = stored(folders, range(count), lambda shard: Sample(**shard.contact or {}))
         remaining = [n for n in range(count) if n not in samples]
         new = self.team.answers([(n, (self.points[n], names)) for n in remaining])
-        try:
-            with interrupt_as_such():
-                for number, sample in self.progress(new, len(remaining)):
-                    samples[number] = sample
-                    if shards is not None:
-                        shards.put(number, Shard({}, dict(vars(sample))))
-        except KeyboardInterrupt:
-            if shards is None or not samples:
-                raise
-            words = f"{len(samples)} of {count} samples are kept; go on with resume=True"
-            raise KeyboardInterrupt(words) from None
+
+        def keep(number: int, sample: Sample) -> None:
+            assert shards is not None
+            shards.put(number, Shard({}, dict(vars(sample))))
+
+        progress = self.progress(new, len(remaining))
+        completed(samples, progress, keep if folders else None, f"{count} samples")
         return self._evaluate(names, [samples[n] for n in range(count)])
 
     def _evaluate(self, names: list[str], samples: list[Sample]) -> Uncertainty:
@@ -362,14 +354,3 @@ def banded_names(results: Results) -> list[str]:
         and not name.endswith(NOT_SAMPLED)
         and not name.startswith(RECORDED)
     ]
-
-
-def _stored(shards: Shards | None, count: int) -> dict[int, Sample]:
-    samples: dict[int, Sample] = {}
-    if shards is None or not shards.resumed:
-        return samples
-    for number in range(count):
-        sample = shards.read(number, lambda shard: Sample(**(shard.contact or {})))
-        if sample is not None:
-            samples[number] = sample
-    return samples

@@ -15,8 +15,7 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, knee_coordinates, knee_pose
 from tkamb.io.scene.uncertainty import UncertaintyTable
-from tkamb.run.guard import interrupt_as_such
-from tkamb.run.recorder import Shard, Shards
+from tkamb.run.recorder import Shard, Shards, completed, stored
 from tkamb.run.results import MIN_SAMPLES
 from tkamb.run.workers import Numbered, PoolOptions, Task
 from tkamb.studies.uncertainty.bands import percentiles
@@ -273,25 +272,17 @@ class Sampling:
         """
         count = self.samples
         normal = normal_samples("lhs", count, len(self.inputs), self.seed) @ self.root.T
-        done: dict[int, Rows] = {}
-        for n in range(count) if shards and shards.resumed else ():
-            if shards and (shard := shards.get(n)):
-                done[n] = shard.contact or {}
+        folders = [] if shards is None else [shards]
+        done: dict[int, Rows] = stored(folders, range(count), lambda shard: shard.contact or {})
         remaining = [(n, normal[n]) for n in range(count) if n not in done]
         task = Task(WearSampler, (simulation, self.inputs, self.constant_share))
-        try:
-            with interrupt_as_such():
-                for number, sample in progress(
-                    (crew or PoolOptions()).answers(task, remaining), len(remaining)
-                ):
-                    done[number] = sample
-                    if shards is not None:
-                        shards.put(number, Shard({}, dict(sample)))
-        except KeyboardInterrupt:
-            if shards is None or not done:
-                raise
-            what = f"{len(done)} of {count} samples are kept; go on with resume=True"
-            raise KeyboardInterrupt(what) from None
+        answers = progress((crew or PoolOptions()).answers(task, remaining), len(remaining))
+
+        def keep(number: int, sample: Rows) -> None:
+            assert shards is not None
+            shards.put(number, Shard({}, dict(sample)))
+
+        completed(done, answers, keep if folders else None, f"{count} samples")
         return _bands(self.inputs, [done[n] for n in range(count)], rows, simulation[1])
 
 

@@ -284,7 +284,8 @@ class WearReport:
 
         surface, maps = self._worn(), self._maps()
         with replaced_together(folder) as files:
-            write_rows(files.path("wear.csv"), _table(self._rows()))
+            rows = self._rows()
+            write_rows(files.path("wear.csv"), [rows[0], *(row.values() for row in rows)])
             write_synced(files.path("wear.json"), json.dumps(self.as_dict(), indent=2) + "\n")
             write_triangles(files.path("wear.vtp"), surface.vertices, surface.faces, maps)
             in_mm = trimesh.Trimesh(surface.vertices / MILLIMETRE, surface.faces, process=False)
@@ -319,11 +320,6 @@ class WearReport:
         weight = self.last.rate * self.last.area
         total = float(weight.sum())
         return float(weight @ self.last.history.cross_shear) / total if total else math.nan
-
-
-def _table(rows: Sequence[dict[str, float]]) -> list[list[str]]:
-    cells = [["" if math.isnan(value) else repr(value) for value in row.values()] for row in rows]
-    return [list(rows[0]), *cells]
 
 
 def _known(value: float) -> float | None:
