@@ -9,7 +9,7 @@ import pytest
 from matplotlib.colors import Normalize
 
 from synthetic_run import make_run
-from tkamb.io.scene.tables import PEAKS_BW, Activity
+from tkamb.io.activities import PEAKS_BW, Activity
 from tkamb.run.maps import ContactMaps
 from tkamb.run.results import Results
 from tkamb.show import style

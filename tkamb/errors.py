@@ -2,9 +2,10 @@
 
 import difflib
 from collections.abc import Iterable
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-import numpy as np
+if TYPE_CHECKING:
+    import numpy as np
 
 Kind = TypeVar("Kind")
 
@@ -63,12 +64,14 @@ def all_of(kind: type[Kind], values: Iterable[Kind], where: str, hint: str) -> t
     return kept
 
 
-def real_numbers(values: Any, where: object, hint: str) -> np.ndarray:
+def real_numbers(values: Any, where: object, hint: str) -> "np.ndarray":
     """Return an argument as an array of float; text, bool and complex numbers are refused.
 
     Raises:
         InputError: see above, or the rows have different lengths.
     """
+    import numpy as np  # `main` sets the threads of BLAS before NumPy is loaded
+
     try:
         array = np.asarray(values)
     except ValueError as error:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from tkamb.commands.options import option
 from tkamb.errors import InputError
+from tkamb.io.activities import Activity
 from tkamb.io.datasets import NAMES, read_dataset
-from tkamb.io.scene.tables import Activity
 from tkamb.units import ANGLE, LENGTH
 
 if TYPE_CHECKING:

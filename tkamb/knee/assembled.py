@@ -170,10 +170,11 @@ class AssembledKnee:
         self._identity = _identity(self)
 
     def _set_ligaments(self, bundles: "Iterable[Ligament]") -> None:
-        from tkamb.knee.ligaments import Ligament
+        if not (isinstance(bundles, tuple) and not bundles):  # a knee without any imports no law
+            from tkamb.knee.ligaments import Ligament
 
-        given = all_of(Ligament, bundles, "ligaments", "give a list of tkamb.Ligament")
-        self.ligaments = tuple(bundle_on_chain(self.bridge, bundle) for bundle in given)
+            bundles = all_of(Ligament, bundles, "ligaments", "give a list of tkamb.Ligament")
+        self.ligaments = tuple(bundle_on_chain(self.bridge, bundle) for bundle in bundles)
         check_names("ligaments", [bundle.name for bundle in self.ligaments])
         self._crossing, self._others = crossing_and_others(self.chain, self.ligaments)
 

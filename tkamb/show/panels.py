@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tkamb.geometry.frames import Array
-from tkamb.io.scene.tables import PEAKS_BW, peaks_words
+from tkamb.io.activities import PEAKS_BW, peaks_words
 from tkamb.run.columns import is_ligament, ligament_of
 from tkamb.run.known_errors import is_large, short_error_words
 from tkamb.run.metrics import (

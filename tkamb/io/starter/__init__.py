@@ -8,7 +8,6 @@ from importlib.resources import as_file, files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tkamb.commands.options import option
 from tkamb.errors import InputError
 
 if TYPE_CHECKING:
@@ -59,10 +58,12 @@ def add_new(commands: Any) -> None:
         help="a commented scene with its files, to start from; a patient from mass and height",
     )
     new.add_argument("folder", type=Path, metavar="FOLDER", help="new or empty")
-    option(new, "--side", "of the knee; default right", choices=("left", "right"))
-    option(new, "--mass-kg KG", "of the body; default 75", float)
-    option(new, "--height-mm MM", "of the body; default 1750", float)
-    option(new, "--sex", "which table of de Leva (1996); default male", choices=("female", "male"))
+    new.add_argument("--side", choices=("left", "right"), help="of the knee; default right")
+    new.add_argument("--mass-kg", type=float, metavar="KG", help="of the body; default 75")
+    new.add_argument("--height-mm", type=float, metavar="MM", help="of the body; default 1750")
+    new.add_argument(
+        "--sex", choices=("female", "male"), help="which table of de Leva (1996); default male"
+    )
     new.set_defaults(command=_new)
 
 
