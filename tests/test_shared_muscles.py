@@ -15,7 +15,6 @@ from shared_trials import SHANK, STRENGTHS, THIGH, two_flexors
 from tkamb.errors import InputError
 from tkamb.geometry.frames import SIDES, knee_axes, knee_pose, pose, transform
 from tkamb.io.scene import load_scene
-from tkamb.knee.condyle_rows import condyle_rows
 from tkamb.knee.crossing import CrossingLines, MuscleShare
 from tkamb.knee.equations import solve_knee
 from tkamb.knee.load import PointForces, total_wrench
@@ -27,6 +26,7 @@ from tkamb.run.columns import (
     in_a_family,
     ordered_names,
 )
+from tkamb.run.muscles.knee_trial import condyle_rows
 from tkamb.run.muscles.shared_muscles import SharedMuscles
 from tkamb.run.summary import reserves
 

@@ -17,8 +17,7 @@ import numpy as np
 
 from tkamb.errors import ComputationError
 from tkamb.geometry.frames import Array, Index, inverse, transform
-from tkamb.knee.string_forces import Tension
-from tkamb.knee.taut_strings import WrappedStrings, inside, strings_over
+from tkamb.knee.taut_strings import Tension, WrappedStrings, inside, strings_over
 
 if TYPE_CHECKING:
     from tkamb.knee.ligaments import Ligament

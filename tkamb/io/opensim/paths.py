@@ -28,8 +28,7 @@ from tkamb.io.opensim.model import (
     OpenSimMuscle,
     Path,
 )
-from tkamb.knee.string_forces import StraightParts, Tension
-from tkamb.knee.taut_strings import strings_over
+from tkamb.knee.taut_strings import StraightParts, Tension, strings_over
 
 # rad or m: margin of the range of a conditional path point, as in OpenSim.
 CONDITION_TOLERANCE = 1e-5

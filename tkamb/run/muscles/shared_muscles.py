@@ -14,7 +14,6 @@ from tkamb.errors import ComputationError, InputError, names_near
 from tkamb.geometry.frames import MIRROR, Array, mirrored_pose
 from tkamb.io.scene.case import Case
 from tkamb.io.scene.tables import MusclesTable
-from tkamb.knee.condyle_rows import condyle_rows
 from tkamb.knee.crossing import (
     CrossingLines,
     FlexionRow,
@@ -23,7 +22,13 @@ from tkamb.knee.crossing import (
     yielding_flexion_row,
 )
 from tkamb.knee.equations import KneeGeometry, SolvedLoads, solve_knee, unsolved
-from tkamb.run.muscles.knee_trial import KneeTrial, LegRecording, group_names, load_knee_trial
+from tkamb.run.muscles.knee_trial import (
+    KneeTrial,
+    LegRecording,
+    condyle_rows,
+    group_names,
+    load_knee_trial,
+)
 from tkamb.run.muscles.sharing import EmgGuide, Sharing
 from tkamb.units import MILLIMETRE
 

@@ -312,7 +312,7 @@ class Sharing:
         lowest: least activation.
         highest: largest activation.
         least_share: least share of each condyle in the load of the knee, see
-            `tkamb.knee.condyle_rows`; 0: a condyle may lift off. Only for tkamb's own knee.
+            `tkamb.run.muscles.knee_trial`; 0: a condyle may lift off. Only for tkamb's own knee.
         law: "isometric" (F_i is the maximal isometric force, without passive force) or "hill", see
             `rigid_tendon_strength`.
     """
