@@ -15,7 +15,7 @@ from tkamb.contact.materials import material
 from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactStatus
 from tkamb.geometry.frames import knee_pose
-from tkamb.studies.extremes import extremes
+from tkamb.studies.cases import extremes
 
 E, NU, RADIUS = 561.5e6, 0.45, 22e-3
 LINEAR, POLYETHYLENE = material("polyethylene-linear"), material("polyethylene")

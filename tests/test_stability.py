@@ -18,7 +18,7 @@ from tkamb.contact.registry import contact_model
 from tkamb.contact.result import ContactStatus
 from tkamb.show.study_figures import picture
 from tkamb.studies import stability
-from tkamb.studies.extremes import Extreme, extremes
+from tkamb.studies.cases import Extreme, extremes
 from tkamb.studies.kept_rows import KeptRows, row_key
 from tkamb.studies.stability import (
     SceneExtreme,

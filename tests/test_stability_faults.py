@@ -13,7 +13,7 @@ from tkamb.contact.lattice import model, report, solver
 from tkamb.contact.lattice.active_set import _forces_of, solve_contact
 from tkamb.contact.lattice.linear import cache
 from tkamb.contact.materials import RambergOsgood
-from tkamb.studies.extremes import Extreme
+from tkamb.studies.cases import Extreme
 from tkamb.studies.references import KEPT_GRID_MM, ClosedForm, closed_forms, press_closed_form
 from tkamb.studies.stability import judge_safely, stored_verdicts
 from tkamb.studies.verdict import PEER_BOUNDS, complaints, peer_distances

@@ -84,7 +84,7 @@ def overrides_of(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _frames(text: str) -> slice:
-    from tkamb.run.frame_choice import frames_slice
+    from tkamb.run.simulation import frames_slice
 
     try:
         return frames_slice(text)

@@ -30,8 +30,16 @@ import trimesh
 from tkamb.errors import ComputationError, TkambError
 from tkamb.geometry.frames import Array
 from tkamb.run.status import FAILED
-from tkamb.studies.cases import SHIPPED_SCENE, change_recording, copied_scene, stretch_time
-from tkamb.studies.extremes import Extreme, Shape, beside_calculix, extremes
+from tkamb.studies.cases import (
+    SHIPPED_SCENE,
+    Extreme,
+    Shape,
+    beside_calculix,
+    change_recording,
+    copied_scene,
+    extremes,
+    stretch_time,
+)
 from tkamb.studies.kept_rows import KeptRows, row_key
 from tkamb.studies.measures import ONE_THREAD, environment
 from tkamb.studies.references import ClosedForm, closed_forms

@@ -38,8 +38,7 @@ from tkamb.contact.pressing import press_by_search
 from tkamb.contact.registry import contact_class, contact_model
 from tkamb.contact.result import ContactResult, ContactStatus, Guess
 from tkamb.errors import ComputationError, InputError, TkambError
-from tkamb.studies.cases import content_hash
-from tkamb.studies.extremes import Extreme
+from tkamb.studies.cases import Extreme, content_hash
 from tkamb.studies.measures import Quantities, errors, quantities
 from tkamb.studies.references import (
     TOLERANCES,

@@ -23,8 +23,8 @@ from tkamb.files import sha256_of
 from tkamb.io.recordings.recording_tables import Count, Number, SceneTable
 from tkamb.io.scene import Scene, load_scene
 from tkamb.io.toml_text import read_toml
-from tkamb.run.frame_choice import frames_slice
 from tkamb.run.identity import files_in, scene_hash
+from tkamb.run.simulation import frames_slice
 
 AXES = ("subject", "trial", "design", "contact")
 GROUP_AXES = ("activity", *AXES[1:])

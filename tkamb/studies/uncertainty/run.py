@@ -17,11 +17,11 @@ from tkamb.errors import InputError
 from tkamb.files import write_rows
 from tkamb.geometry.frames import Array
 from tkamb.io.claim import claimed_directory
-from tkamb.io.hdf5_file import new_hdf5
 from tkamb.io.scene import Scene, load_scene
 from tkamb.io.scene.case import Case, load_case
 from tkamb.run.claims import peaks
 from tkamb.run.columns import KINDS
+from tkamb.run.maps import new_hdf5
 from tkamb.run.recorder import Shard, Shards, completed, stored
 from tkamb.run.results import MIN_SAMPLES, Results
 from tkamb.run.results_folder import (
