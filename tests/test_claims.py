@@ -14,9 +14,8 @@ from tkamb.run.claims import FORCES, measured_trials, method_error, peaks_of, sp
 from tkamb.run.simulation import simulate
 from tkamb.show.axis import horizontal_axis
 from tkamb.show.headline import cards, peak_lines
-from tkamb.show.methods import methods
 from tkamb.show.report import report_html
-from tkamb.show.sections import conclusions, lead, motion_table
+from tkamb.show.sections import conclusions, lead, methods, motion_table
 from tkamb.show.view.draw import readings
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -17,7 +17,7 @@ from tkamb.io.scene.case import load_case
 from tkamb.knee.ligaments import BUNDLES
 from tkamb.run.results import read_csv
 from tkamb.run.summary import measures
-from tkamb.show.methods import methods
+from tkamb.show.sections import methods
 
 
 @pytest.fixture(scope="module")

@@ -18,9 +18,9 @@ from tkamb.run.recorder import Shards
 from tkamb.run.workers import PoolOptions
 from tkamb.studies.uncertainty.inputs import Draw, VariedInput
 from tkamb.studies.wear.bands import Sampling, check_samples, moved_case, varied_wear_inputs
+from tkamb.studies.wear.engine import ArticularSurface
 from tkamb.studies.wear.laws import Archard, LogarithmicCreep
 from tkamb.studies.wear.simulation import WearCase, simulate_wear
-from tkamb.studies.wear.worn_surface import ArticularSurface
 from wear_bodies import DENSITY, MM, Pressed, always, ball_case, balls_scene, stroke, swing
 
 FACTOR = VariedInput("wear_factor", 0.44, "relative")

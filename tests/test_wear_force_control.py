@@ -15,7 +15,7 @@ from tkamb.contact.registry import contact_model
 from tkamb.errors import InputError
 from tkamb.geometry.frames import knee_coordinates, knee_pose
 from tkamb.studies.wear import run as wear_run
-from tkamb.studies.wear.engine import ContactEngine
+from tkamb.studies.wear.engine import ArticularSurface, ContactEngine
 from tkamb.studies.wear.laws import Archard
 from tkamb.studies.wear.motion import CycleMotion
 from tkamb.studies.wear.simulation import WearCase, simulate_wear
@@ -28,7 +28,6 @@ from tkamb.studies.wear.simulator import (
     read_springs,
     zero_at,
 )
-from tkamb.studies.wear.worn_surface import ArticularSurface
 from wear_bodies import DENSITY, MM, balls, balls_scene
 
 AP, SI, ML, AXIAL_ROTATION = 0, 1, 2, 3

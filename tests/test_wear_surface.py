@@ -5,7 +5,7 @@ import pytest
 
 import shapes
 from contact_bodies import dished_insert, flat_insert
-from tkamb.studies.wear.worn_surface import ArticularSurface, refined, volume
+from tkamb.studies.wear.engine import ArticularSurface, refined, volume
 
 MM = 1e-3
 

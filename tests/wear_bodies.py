@@ -12,11 +12,10 @@ from tkamb.contact.materials import material
 from tkamb.contact.registry import contact_model
 from tkamb.geometry.frames import inverse, pose, transform
 from tkamb.geometry.surface import Surface
-from tkamb.studies.wear.engine import ContactEngine, CycleMaps
+from tkamb.studies.wear.engine import ArticularSurface, ContactEngine, CycleMaps
 from tkamb.studies.wear.laws import Archard
 from tkamb.studies.wear.motion import CycleMotion
 from tkamb.studies.wear.simulation import WearCase
-from tkamb.studies.wear.worn_surface import ArticularSurface
 
 MM = 1e-3
 DENSITY = 930.0

@@ -235,7 +235,7 @@ def _report(options: argparse.Namespace) -> int:
 
 def _methods(options: argparse.Namespace) -> int:
     from tkamb.run.results_folder import read_results
-    from tkamb.show.methods import methods
+    from tkamb.show.sections import methods
 
     print(methods(read_results(options.folder).summary).text())
     return 0

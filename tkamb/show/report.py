@@ -25,7 +25,6 @@ from tkamb.show.axis import (
 )
 from tkamb.show.frame_maps import draw_insert, frame_maps, largest_pressure
 from tkamb.show.headline import cards, run_title
-from tkamb.show.methods import methods
 from tkamb.show.pages import asset, policy_sources, render
 from tkamb.show.panels import Panel, centre_panel, panels
 from tkamb.show.plots import WIDTH, Sheet
@@ -40,6 +39,7 @@ from tkamb.show.sections import (
     conclusions,
     flag_rows,
     lead,
+    methods,
     motion_table,
     strain_table,
     wear_section,

@@ -24,10 +24,9 @@ from tkamb.run.results import Results
 from tkamb.run.results_folder import read_results
 from tkamb.run.simulation import simulate
 from tkamb.studies.uncertainty.inputs import uncertainty_of
-from tkamb.studies.wear.engine import ContactEngine
+from tkamb.studies.wear.engine import ArticularSurface, ContactEngine
 from tkamb.studies.wear.motion import CycleMotion, check_closing, chosen_frames
 from tkamb.studies.wear.simulator import Profile, Springs, read_profile, read_springs
-from tkamb.studies.wear.worn_surface import ArticularSurface
 from tkamb.units import MILLIMETRE
 
 Progress = Callable[[Sequence[int]], Iterable[int]]

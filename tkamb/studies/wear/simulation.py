@@ -10,10 +10,16 @@ import numpy as np
 from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 from tkamb.geometry.surface import Surface
-from tkamb.studies.wear.engine import CycleMaps, SlidingHistory, interpolation, scaled_to_load
+from tkamb.studies.wear.engine import (
+    ArticularSurface,
+    CycleMaps,
+    SlidingHistory,
+    interpolation,
+    scaled_to_load,
+    volume,
+)
 from tkamb.studies.wear.laws import LogarithmicCreep, WearLaw
 from tkamb.studies.wear.motion import CycleMotion
-from tkamb.studies.wear.worn_surface import ArticularSurface, volume
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
 
