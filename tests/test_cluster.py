@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -54,7 +53,7 @@ def test_a_cluster_prepares_once_and_gives_the_results_of_this_process():
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense"])
 def test_a_missing_scheduler_is_an_error_of_one_line(address, tmp_path, monkeypatch, capsys):
     distributed()
-    monkeypatch.setattr(cluster, "CLUSTER", replace(cluster.CLUSTER, answer_seconds=0.5))
+    monkeypatch.setattr(cluster, "ANSWER_SECONDS", 0.5)
     folder = tmp_path / "out"
     assert main(["uncertainty", str(SCENE), "--dask", address, "--out", str(folder)]) == 2
     message = capsys.readouterr().err.strip()

@@ -20,7 +20,7 @@ from scenes import MODEL, write_scene
 from tkamb.cli import main
 from tkamb.errors import InputError, TkambError
 from tkamb.io.scene.case import load_case
-from tkamb.show.view.bench import BENCH_LIMIT, BenchRequest, Placement
+from tkamb.show.view.bench import KEPT_MODELS, MOST_THREADS, BenchRequest, Placement
 from tkamb.show.view.live import LiveKnee, setting
 from tkamb.show.view.live_window import LiveWindow, bench_of_knee
 from tkamb.show.view.show import serve_in_background
@@ -325,14 +325,14 @@ def test_few_models_are_prepared_at_a_time_and_the_oldest_are_deleted(monkeypatc
     requests = [replace(bench.recorded(60), resolution_mm=1.0 + 0.1 * k) for k in range(12)]
     for request in requests:
         assert bench.preparing(request)
-    assert len(bench._threads) == BENCH_LIMIT.most_threads == len(begun)
+    assert len(bench._threads) == MOST_THREADS == len(begun)
     assert "then" in bench.preparing(requests[-1])
     go_on.set()
     for request in requests[2:]:
         while bench.preparing(request):
             time.sleep(0.005)
     assert not bench._threads
-    assert [*bench._recordings] == [setting(one) for one in requests[-BENCH_LIMIT.kept_models :]]
+    assert [*bench._recordings] == [setting(one) for one in requests[-KEPT_MODELS:]]
 
 
 def test_an_insert_is_deleted_with_the_last_model_that_needs_it(knee):

@@ -66,44 +66,26 @@ COLUMNS = {
 """Column of results.csv -> force whose discrepancy applies to it."""
 
 
-@dataclass(frozen=True)
-class DiscrepancySettings:
-    """How the discrepancy is fitted and added to the samples."""
+# 1: numbers of quantiles that represent Student's t and the samples. More change the ends of a band
+# by less than 1 %.
+QUANTILES = 201
+SAMPLE_QUANTILES = 60
+# BW: F0, the load below which errors do not become smaller. The likelihood of the errors of open
+# trials is flat from 0.3 to 0.5 BW.
+LEAST_LOAD_BW = 0.5
+# BW: root mean square of G over a gait cycle. It converts published errors in walking to shares of
+# the load. Subject JW's measured trials og1 and og3 have 1.62 and 1.65.
+WALKING_LOAD_BW = 1.6
+# Least number of frames of a trial. A standard deviation of fewer values is uncertain by more than
+# a third.
+FEWEST_FRAMES = 5
+PUBLISHED = {"total": (0.43, 1), "medial": (0.41, 4), "lateral": (0.43, 4)}
+"""Force -> published root mean square error in walking (BW), and the number of published errors.
 
-    quantiles: int = 201
-    """1: number of quantiles that represent Student's t. More change the ends of a band by less
-    than 1 %."""
-    sample_quantiles: int = 60
-    """1: number of quantiles that represent the samples. More change the ends of a band by less
-    than 1 %."""
-    least_load_BW: float = 0.5
-    """BW: F0, the load below which errors do not become smaller. The likelihood of the open trials'
-    errors is flat from 0.3 to 0.5 BW."""
-    walking_load_BW: float = 1.6
-    """BW: root mean square of G over a gait cycle. It converts published errors in walking to
-    shares of the load. Subject JW's measured trials og1 and og3 have 1.62 and 1.65."""
-    published_total_BW: float = 0.43
-    """BW: root mean square error of a published blind prediction of the total force in walking,
-    281 N (parametric model, third Grand Challenge, PMC3627216), divided by JW's weight."""
-    published_medial_BW: float = 0.41
-    """BW: published root mean square error of the medial force in walking, the middle of 229 to
-    312 N by the four winners of the Grand Challenges (Kinney et al. 2013,
-    doi:10.1115/1.4023255)."""
-    published_lateral_BW: float = 0.43
-    """BW: published root mean square error of the lateral force in walking, the middle of 238 to
-    326 N by the same winners."""
-    published_total_numbers: int = 1
-    """1: number of published errors of the total force."""
-    published_medial_numbers: int = 4
-    """1: number of published errors of the medial force."""
-    published_lateral_numbers: int = 4
-    """1: number of published errors of the lateral force."""
-    fewest_frames: int = 5
-    """1: least number of frames of a trial. A standard deviation of fewer values is
-    uncertain by more than a third."""
-
-
-DISCREPANCY = DiscrepancySettings()
+Total: a blind prediction, 281 N (parametric model, third Grand Challenge, PMC3627216), divided by
+JW's weight. Medial and lateral: the middle of 229 to 312 N and of 238 to 326 N by the four winners
+of the Grand Challenges (Kinney et al. 2013, doi:10.1115/1.4023255).
+"""
 
 
 @dataclass(frozen=True)
@@ -159,7 +141,7 @@ def load_of(total: Array, body_weight: float) -> Array:
     load = np.full(total.shape[1], np.nan)
     finite = np.isfinite(total).any(axis=0)
     load[finite] = np.nanmedian(total[:, finite], axis=0)
-    return np.hypot(load, DISCREPANCY.least_load_BW * body_weight)
+    return np.hypot(load, LEAST_LOAD_BW * body_weight)
 
 
 def trial_error(
@@ -181,7 +163,7 @@ def trial_error(
     """
     enough = np.isfinite(samples).sum(axis=0) > samples.shape[0] / 2
     compared = enough & np.isfinite(measured) & np.isfinite(nominal)
-    if compared.sum() < DISCREPANCY.fewest_frames:
+    if compared.sum() < FEWEST_FRAMES:
         return None
     shares = samples[:, compared] / load[compared]
     error = measured[compared] / load[compared] - np.nanmedian(shares, axis=0)
@@ -220,12 +202,11 @@ def fitted(errors: Sequence[TrialError], force: str, activity: str | None) -> Di
     biases = np.array([one.bias**2 for one in chosen])
     scatters = np.array([one.scatter**2 for one in chosen])
     share = float(biases.sum() / max((biases + scatters).sum(), np.finfo(float).tiny))
-    published = float(getattr(DISCREPANCY, f"published_{force}_BW")) / DISCREPANCY.walking_load_BW
+    published, numbers = PUBLISHED[force][0] / WALKING_LOAD_BW, PUBLISHED[force][1]
     weight = 0.5 * (1.0 + 1.0 / (len(activity_biases) + 1))  # of S² in A
     of_published = (weight * share + 1.0 - share) * published**2
     of_trials = weight * biases + scatters
     frames = np.array([max(1.0, one.independent_frames - 1.0) for one in chosen])
-    numbers = float(getattr(DISCREPANCY, f"published_{force}_numbers"))
     uncertain = of_published**2 / numbers
     uncertain += float(((weight * biases) ** 2 + scatters**2 / frames).sum())
     total = of_published + float(of_trials.sum())
@@ -252,7 +233,7 @@ def band_with_discrepancy(
         samples: force of each sample, (n, f); NaN in failed frames.
         load: load G from `load_of` in the samples' unit, (f,).
     """
-    added = stdtrit(discrepancy.freedom, _middles(DISCREPANCY.quantiles))
+    added = stdtrit(discrepancy.freedom, _middles(QUANTILES))
     added = discrepancy.mean + discrepancy.deviation * added
     ends = np.full((len(percents), samples.shape[1]), np.nan)
     finite = np.isfinite(samples).any(axis=0) & np.isfinite(load)
@@ -260,7 +241,7 @@ def band_with_discrepancy(
         return ends
     of_samples = np.nanpercentile(
         samples[:, finite],
-        100.0 * _middles(DISCREPANCY.sample_quantiles),
+        100.0 * _middles(SAMPLE_QUANTILES),
         axis=0,
         method=QUANTILE_METHOD,
     )

@@ -31,19 +31,11 @@ from tkamb.run.guard import log_to_stderr, open_streams, unforeseen_words
 LOCAL = "local"
 
 
-@dataclass(frozen=True)
-class ClusterSettings:
-    """Limits for a Dask cluster."""
+# s: time limit for the answer of a scheduler. An idle scheduler answers within one second.
+ANSWER_SECONDS = 10.0
+# 1: workers that may die in one job before the run fails. The job is then the likely cause.
+MOST_DEATHS = 5
 
-    answer_seconds: float = 10.0
-    """s: time limit for the answer of a scheduler. An idle scheduler answers within
-    one second."""
-    most_deaths: int = 5
-    """1: workers that may die in one job before the run fails. The job is then the
-    likely cause."""
-
-
-CLUSTER = ClusterSettings()
 
 FINISHED_KEPT = "what is finished is kept: go on with resume=True"
 
@@ -60,13 +52,13 @@ def _library() -> Any:
     except ImportError:
         hint = "pip install 'tkamb[cluster]'"
         raise InputError("Dask is not installed", "--dask", hint) from None
-    dask.config.set({"distributed.scheduler.allowed-failures": CLUSTER.most_deaths})
+    dask.config.set({"distributed.scheduler.allowed-failures": MOST_DEATHS})
     return distributed
 
 
 def _connected(distributed: Any, address: str) -> Any:
     try:
-        return distributed.Client(address, timeout=CLUSTER.answer_seconds)
+        return distributed.Client(address, timeout=ANSWER_SECONDS)
     except (OSError, ValueError, TypeError) as error:  # no answer, or an invalid address
         raise InputError(
             f"no Dask scheduler answers at '{address}' ({type(error).__name__})",
@@ -91,7 +83,7 @@ def _cluster_answers(
                     raise ComputationError("the Dask scheduler has ended", "--dask", FINISHED_KEPT)
                 yield futures.pop(future), future.result()
     except distributed.KilledWorker:
-        what = f"a job killed {CLUSTER.most_deaths} workers"
+        what = f"a job killed {MOST_DEATHS} workers"
         raise ComputationError(
             what, "--dask", f"check that a worker has enough memory; {FINISHED_KEPT}"
         ) from None

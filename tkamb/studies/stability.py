@@ -206,29 +206,20 @@ STORED = Path(__file__).with_name("verdicts.json")
 """Accepted verdict on each case. `scripts/make/stability_verdicts` writes the file."""
 
 
-@dataclass(frozen=True)
-class StabilitySettings:
-    """Limits of the stability study."""
+# s: processor time limit of a model; a longer case is a hang. Usual cases take seconds.
+LONGEST_SECONDS = 120.0
+# s: processor time limit of a reference; a longer case is unverified. The study should end within
+# a day.
+LONGEST_REFERENCE_SECONDS = 900.0
+# Number of processes of the study. A small computer has two cores.
+WORKERS = 2
+# Stride of the extreme cases that the quick study takes. It should take minutes.
+QUICK_SHARE = 13
+# mm: smallest cell size of the quick study. It should take minutes.
+QUICK_GRID_MM = 3.0
+# Number of cases of the quick study with a stored result of CalculiX. It should take minutes.
+QUICK_WITH_PEER = 4
 
-    longest_seconds: float = 120.0
-    """s: processor time limit of a model; a longer case is a hang. Usual cases take
-    seconds."""
-    longest_reference_seconds: float = 900.0
-    """s: processor time limit of a reference; a longer case is unverified. The study should
-    end within a day."""
-    workers: int = 2
-    """Number of processes of the study. A small computer has two cores."""
-    quick_share: int = 13
-    """Stride of the extreme cases that the quick study takes. It should take
-    minutes."""
-    quick_grid_mm: float = 3.0
-    """mm: smallest cell size of the quick study. It should take minutes."""
-    quick_with_peer: int = 4
-    """Number of cases of the quick study with a stored result of CalculiX. It should
-    take minutes."""
-
-
-STABILITY = StabilitySettings()
 
 PRESSED = "pressed"
 """Message that a process sends when the model has a result."""
@@ -239,12 +230,10 @@ def stability_cases(quick: bool) -> list[Case]:
     """Return the cases of the full or the quick study."""
     if not quick:
         return [*closed_forms(False), *extremes(), *scene_extremes()]
-    coarse = (
-        replace(c, resolution_mm=max(c.resolution_mm, STABILITY.quick_grid_mm)) for c in extremes()
-    )
-    sample = [*dict.fromkeys(coarse)][:: STABILITY.quick_share]
-    shapes = [Extreme(resolution_mm=STABILITY.quick_grid_mm, shape=shape) for shape in QUICK_SHAPES]
-    with_calculix = list(beside_calculix())[: STABILITY.quick_with_peer]
+    coarse = (replace(c, resolution_mm=max(c.resolution_mm, QUICK_GRID_MM)) for c in extremes())
+    sample = [*dict.fromkeys(coarse)][::QUICK_SHARE]
+    shapes = [Extreme(resolution_mm=QUICK_GRID_MM, shape=shape) for shape in QUICK_SHAPES]
+    with_calculix = list(beside_calculix())[:QUICK_WITH_PEER]
     return [*closed_forms(True), *dict.fromkeys((*with_calculix, *shapes, *sample))]
 
 
@@ -258,9 +247,9 @@ def stored_verdicts(path: Path = STORED) -> dict[str, str]:
 
 def run_stability(
     cases: Sequence[Case],
-    longest: float = STABILITY.longest_seconds,
+    longest: float = LONGEST_SECONDS,
     kept: KeptRows | None = None,
-    workers: int = STABILITY.workers,
+    workers: int = WORKERS,
 ) -> Iterator[Verdict]:
     """Judge all cases and yield their verdicts in the order of the cases.
 
@@ -282,7 +271,7 @@ def run_stability(
 
 
 def kept_verdicts(
-    cases: Sequence[Case], kept: KeptRows, longest: float = STABILITY.longest_seconds
+    cases: Sequence[Case], kept: KeptRows, longest: float = LONGEST_SECONDS
 ) -> list[Verdict]:
     """Return all stored verdicts in the order of the cases, also those not yet yielded."""
     rows, stored = [_kept_verdict(kept, case, longest) for case in cases], stored_verdicts()
@@ -332,7 +321,7 @@ class _Judges:
 
     def _judge_in_process(self, case: Case) -> Verdict:
         receiver, sender = self._context.Pipe(duplex=False)
-        limits = self.limit(case), STABILITY.longest_reference_seconds
+        limits = self.limit(case), LONGEST_REFERENCE_SECONDS
         process = self._context.Process(
             target=_send_verdict, args=(case, sender, *limits), daemon=True
         )

@@ -29,32 +29,24 @@ from tkamb.io.recordings.patient import RigidInertia, Sex, combined, segment_ine
 MESHES = ("femoral_component", "insert", "patellar_button")
 
 
-@dataclass(frozen=True)
-class LegProportionSettings:
-    """Lengths of a leg as shares of body height, and the position of the implant in it."""
-
-    ankle: float = 0.039
-    """Height of the ankle's centre above ground, as a share of body height; Winter (2009)."""
-    shank: float = 0.246
-    """Distance from ankle centre to knee centre, as a share of body height; Winter (2009)."""
-    thigh: float = 0.245
-    """Distance from knee centre to hip centre, as a share of body height; Winter (2009)."""
-    insert_below_knee: float = 0.018662
-    """m: depth of the insert's bottom below the knee's centre, as in the shipped patient."""
-    hip_below_thigh_end: float = 0.004367
-    """m: height of the femoral component's origin above the knee's centre, as in the shipped
-    patient."""
-    lightest: float = 20.0
-    """kg: smallest accepted mass. It excludes masses in other units."""
-    heaviest: float = 300.0
-    """kg: greatest accepted mass. It excludes masses in other units."""
-    shortest: float = 1.0
-    """m: smallest accepted height. It excludes heights in other units."""
-    tallest: float = 2.3
-    """m: greatest accepted height. It excludes heights in other units."""
-
-
-LEG_PROPORTIONS = LegProportionSettings()
+# Height of the ankle's centre above ground, as a share of body height; Winter (2009).
+ANKLE = 0.039
+# Distance from ankle centre to knee centre, as a share of body height; Winter (2009).
+SHANK = 0.246
+# Distance from knee centre to hip centre, as a share of body height; Winter (2009).
+THIGH = 0.245
+# m: depth of the insert's bottom below the knee's centre, as in the shipped patient.
+INSERT_BELOW_KNEE = 0.018662
+# m: height of the femoral component's origin above the knee's centre, as in the shipped patient.
+HIP_BELOW_THIGH_END = 0.004367
+# kg: smallest accepted mass. It excludes masses in other units.
+LIGHTEST = 20.0
+# kg: greatest accepted mass. It excludes masses in other units.
+HEAVIEST = 300.0
+# m: smallest accepted height. It excludes heights in other units.
+SHORTEST = 1.0
+# m: greatest accepted height. It excludes heights in other units.
+TALLEST = 2.3
 
 
 @dataclass(frozen=True)
@@ -73,23 +65,22 @@ class Person:
     sex: Sex = "male"
 
     def __post_init__(self) -> None:
-        limits = LEG_PROPORTIONS
-        if not limits.lightest <= self.mass <= limits.heaviest:
-            hint = f"give {limits.lightest:g} to {limits.heaviest:g} kg"
+        if not LIGHTEST <= self.mass <= HEAVIEST:
+            hint = f"give {LIGHTEST:g} to {HEAVIEST:g} kg"
             raise InputError(f"a body of {self.mass:g} kg", "--mass-kg", hint)
-        if not limits.shortest <= self.height <= limits.tallest:
-            hint = f"give {limits.shortest * 1e3:g} to {limits.tallest * 1e3:g}, in mm"
+        if not SHORTEST <= self.height <= TALLEST:
+            hint = f"give {SHORTEST * 1e3:g} to {TALLEST * 1e3:g}, in mm"
             raise InputError(f"a height of {self.height * 1e3:g} mm", "--height-mm", hint)
 
     @property
     def knee_height(self) -> float:
         """Height of the insert's bottom above the ankle's centre, m."""
-        return LEG_PROPORTIONS.shank * self.height - LEG_PROPORTIONS.insert_below_knee
+        return SHANK * self.height - INSERT_BELOW_KNEE
 
     @property
     def hip_height(self) -> float:
         """Height of the hip's centre above the femoral component's origin, m."""
-        return LEG_PROPORTIONS.thigh * self.height - LEG_PROPORTIONS.hip_below_thigh_end
+        return THIGH * self.height - HIP_BELOW_THIGH_END
 
     def inertias(self) -> dict[str, RigidInertia]:
         """Return link -> its inertia in its frame: "tibia" (shank and foot) and "femur"."""
@@ -129,7 +120,7 @@ def patient_urdf(text: str, person: Person) -> str:
     robot = ElementTree.fromstring(text)
     robot.set("name", "patient")
     heights = {
-        "ankle": LEG_PROPORTIONS.ankle * person.height,
+        "ankle": ANKLE * person.height,
         "knee_ap": person.knee_height,
         "hip_centre": person.hip_height,
     }
@@ -158,7 +149,7 @@ def scene_text(text: str, person: Person) -> str:
         "height_mm": f"{person.height * 1e3:g}",
     }.items():
         text = re.sub(rf"(?m)^{key} = [^\s#]+", f"{key} = {value}", text)
-    ankle = LEG_PROPORTIONS.ankle * person.height * 1e3
+    ankle = ANKLE * person.height * 1e3
     text = re.sub(r"(?m)^ankle_mm = \[.*?\]", f"ankle_mm = [0.0, {ankle:.2f}, 0.0]", text)
     knee_up = (person.knee_height - default_person.knee_height) * 1e3
     thigh = person.hip_height / default_person.hip_height
@@ -168,7 +159,7 @@ def scene_text(text: str, person: Person) -> str:
         x, y, z = (float(value) for value in match["point"].split(","))
         if match["link"] == "tibia":
             y += knee_up  # all attachments on the tibia are near the knee
-        elif match["link"] == "femur" and y > LEG_PROPORTIONS.insert_below_knee * 1e3:
+        elif match["link"] == "femur" and y > INSERT_BELOW_KNEE * 1e3:
             y *= thigh  # on the shaft; points near the knee keep their distance from the implant
         z = mirror * z + 0.0
         return f'link = "{match["link"]}", point_mm = [{x:g}, {round(y, 3):g}, {z:g}]'

@@ -32,20 +32,12 @@ from tkamb.run.muscles.knee_trial import (
 from tkamb.run.muscles.sharing import EmgGuide, Sharing
 from tkamb.units import MILLIMETRE
 
-
-@dataclass(frozen=True)
-class SharedMuscleSettings:
-    """Muscles of a leg with tkamb's knee."""
-
-    max_offset: float = 0.5 * MILLIMETRE
-    """m: largest distance of insert and hip between URDF and muscle model. The
-    rounding of the two files is smaller."""
-    max_iterations: int = 8
-    """1: largest number of iterations, each with muscle forces for the condyles lifted so far. A
-    frame that needs more fails. Not studied."""
-
-
-SHARED_MUSCLES = SharedMuscleSettings()
+# m: largest distance of insert and hip between URDF and muscle model. The rounding of the two
+# files is smaller.
+MAX_OFFSET = 0.5 * MILLIMETRE
+# 1: largest number of iterations, each with muscle forces for the condyles lifted so far. A frame
+# that needs more fails. Not studied.
+MAX_ITERATIONS = 8
 
 
 class SharedMuscles:
@@ -155,7 +147,7 @@ class FrameMuscles:
         lifts off.
         """
         lifted = geometry.lifted
-        for _ in range(SHARED_MUSCLES.max_iterations):
+        for _ in range(MAX_ITERATIONS):
             share = self.share(geometry, friction, lifted)
             geometry = replace(geometry, share=share)
             if share.status != "ok":
@@ -300,7 +292,7 @@ def _check_links(case: Case, insert_in_tibia: Array, hip: Array) -> None:
         ("hip", centre, case.chain.link_in("hip", "femur")[:3, 3]),
     ):
         apart = float(np.linalg.norm(ours - theirs))
-        if apart > SHARED_MUSCLES.max_offset:
+        if apart > MAX_OFFSET:
             raise InputError(
                 f"has its {name} {apart / MILLIMETRE:.1f} mm away from the {name} of the URDF",
                 table.model,

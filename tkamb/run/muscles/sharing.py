@@ -32,21 +32,13 @@ from tkamb.geometry.frames import Array
 from tkamb.io.opensim.model import OpenSimMuscle
 from tkamb.run.muscles.leg import LONGEST_FIBRE_RATIO
 
+# 1: change of the activations below which the sequence for p > 2 has converged. Not studied.
+NEWTON_TOLERANCE = 1e-10
+# 1: largest number of quadratic programmes for p > 2. Not studied.
+MOST_STEPS = 60
+# 1: primal and dual tolerance of DAQP. Chosen for rows that are scaled to about 1.
+SOLVER_TOLERANCE = 1e-11
 
-@dataclass(frozen=True)
-class StaticOptimisationSettings:
-    """Stopping criteria of the static optimisation of a frame."""
-
-    newton_tolerance: float = 1e-10
-    """1: change of the activations below which the sequence for p > 2 has converged.
-    Not studied."""
-    most_steps: int = 60
-    """1: largest number of quadratic programmes for p > 2. Not studied."""
-    solver_tolerance: float = 1e-11
-    """1: primal and dual tolerance of DAQP. Chosen for rows that are scaled to about 1."""
-
-
-STATIC_OPTIMISATION = StaticOptimisationSettings()
 
 OPTIMAL = 1
 """DAQP's exit flag of a solution."""
@@ -169,9 +161,9 @@ def share_load(problem: LoadSharing) -> Shared:
         step = _descending(problem, a, target - a)
         steps += 1
         change, a = float(np.abs(step).max()), a + step
-        if change < STATIC_OPTIMISATION.newton_tolerance:
+        if change < NEWTON_TOLERANCE:
             break
-        if steps == STATIC_OPTIMISATION.most_steps:
+        if steps == MOST_STEPS:
             raise ComputationError("static optimisation does not converge", "muscles")
     shared = Shared(a, problem.others(a), own, other, np.nan, steps)
     return replace(shared, kkt_residual=kkt_residual(problem, shared))
@@ -225,8 +217,8 @@ def _programme(problem: LoadSharing, hessian: Array, gradient: Array) -> tuple[A
         np.concatenate([problem.highest, upper]),
         np.concatenate([problem.lowest, lower]),
         np.where(equal, 5, 0).astype(np.intc),  # DAQP marks an equality by 5
-        primal_tol=STATIC_OPTIMISATION.solver_tolerance,
-        dual_tol=STATIC_OPTIMISATION.solver_tolerance,
+        primal_tol=SOLVER_TOLERANCE,
+        dual_tol=SOLVER_TOLERANCE,
     )
     if flag != OPTIMAL:
         what = "no muscle forces within their limits balance the joint moments"

@@ -35,49 +35,35 @@ if TYPE_CHECKING:
     from tkamb.knee.ligaments import Ligament
 
 
-@dataclass(frozen=True)
-class BenchLimitSettings:
-    """Ranges of the sliders of `tkamb live`."""
-
-    flexion_deg: tuple[float, float] = (-20.0, 160.0)
-    """deg: smallest and largest flexion. A scene accepts them even if a component is
-    rotated by `placement_deg`, so every state can be saved."""
-    adduction_deg: float = 20.0
-    """deg: largest varus or valgus. Chosen for the same reason as `flexion_deg`."""
-    axial_rotation_deg: float = 60.0
-    """deg: largest internal or external rotation. Chosen for the same reason as `flexion_deg`."""
-    length_mm: float = 60.0
-    """mm: largest translation of the femur. The femur is then beside the insert."""
-    placement_deg: float = 20.0
-    """deg: largest change of a component's orientation. Surgical errors are below
-    it."""
-    placement_mm: float = 20.0
-    """mm: largest change of a component's position. Surgical errors are smaller."""
-    load_N: float = 15_000.0
-    """N: largest axial load. Load and weight of the shank together are below the
-    largest force that a scene accepts from a force plate."""
-    slack_percent: float = 20.0
-    """%: largest increase or decrease of the ligaments' slack lengths. Ligaments of
-    the knee rupture at strains of 12 to 20 %."""
-    finest_mm: float = 0.5
-    """mm: smallest spacing of the map. A finer map cannot follow a slider."""
-    coarsest_mm: float = 10.0
-    """mm: largest spacing of the map. Equal to the limit in `MapGridSettings`."""
-    thickness_mm: tuple[float, float] = (4.0, 25.0)
-    """mm: smallest and largest thickness of a parametric insert. Inserts are sold
-    with 6 to 20 mm."""
-    kept_models: int = 8
-    """Number of prepared contact models that stay in memory. A lattice takes 0.1 to
-    0.5 GB."""
-    most_threads: int = 2
-    """Number of contact models that are prepared at the same time. The machine must
-    still compute the coarse model while a slider moves."""
-    first_penetration: float = 5e-5
-    """m: penetration at which a search for released coordinates begins. Equal to
-    `initial_pose.first_penetration`."""
-
-
-BENCH_LIMIT = BenchLimitSettings()
+RANGES = {
+    # A scene accepts these angles even if a component is rotated by `PLACEMENT_DEG`, so every state
+    # can be saved.
+    "flexion_deg": (-20.0, 160.0),
+    "adduction_deg": (-20.0, 20.0),
+    "axial_rotation_deg": (-60.0, 60.0),
+    # The femur is then beside the insert.
+    "ap_mm": (-60.0, 60.0),
+    "ml_mm": (-60.0, 60.0),
+    # Load and weight of the shank together are below the largest force that a scene accepts from a
+    # force plate.
+    "load_N": (0.0, 15_000.0),
+    # Ligaments of the knee rupture at strains of 12 to 20 %.
+    "slack_percent": (-20.0, 20.0),
+    # A finer map cannot follow a slider. The coarsest is the limit in `MapGridSettings`.
+    "resolution_mm": (0.5, 10.0),
+    # Inserts are sold with 6 to 20 mm.
+    "thickness_mm": (4.0, 25.0),
+}
+"""Ranges of the sliders of `tkamb live`."""
+# deg and mm: largest change of a component's orientation and position. Surgical errors are smaller.
+PLACEMENT_DEG = PLACEMENT_MM = 20.0
+# Number of prepared contact models that stay in memory. A lattice takes 0.1 to 0.5 GB.
+KEPT_MODELS = 8
+# Number of contact models that are prepared at the same time. The machine must still compute the
+# coarse model while a slider moves.
+MOST_THREADS = 2
+# m: penetration at which a search for released coordinates begins, as `InitialPoseSettings`.
+FIRST_PENETRATION = 5e-5
 
 
 @dataclass(frozen=True)
@@ -155,7 +141,7 @@ class BenchRequest:
             elif key == "thickness_mm" and value is None:
                 arguments[key] = None
             else:
-                arguments[key] = _number(key, value, *_range(key))
+                arguments[key] = _number(key, value, *RANGES[key])
         return BenchRequest(**arguments)
 
     def coordinates(self) -> Array:
@@ -170,21 +156,6 @@ class BenchRequest:
         return np.array([values.get(name, 0.0) for name in KNEE_COORDINATES])
 
 
-def _range(key: str) -> tuple[float, float]:
-    limits = BENCH_LIMIT
-    return {
-        "flexion_deg": limits.flexion_deg,
-        "adduction_deg": (-limits.adduction_deg, limits.adduction_deg),
-        "axial_rotation_deg": (-limits.axial_rotation_deg, limits.axial_rotation_deg),
-        "ap_mm": (-limits.length_mm, limits.length_mm),
-        "ml_mm": (-limits.length_mm, limits.length_mm),
-        "load_N": (0.0, limits.load_N),
-        "slack_percent": (-limits.slack_percent, limits.slack_percent),
-        "resolution_mm": (limits.finest_mm, limits.coarsest_mm),
-        "thickness_mm": limits.thickness_mm,
-    }[key]
-
-
 def _number(key: str, value: Any, low: float, high: float) -> float:
     good = isinstance(value, int | float) and not isinstance(value, bool)
     if not good or not low <= value <= high:  # NaN fails this test too
@@ -196,20 +167,10 @@ def _placement(name: str, values: Any) -> Placement:
     names = {one.name for one in fields(Placement)}
     if not isinstance(values, Mapping) or not set(values) <= names:
         raise InputError(f"{name} is no placement", "bench", f"keys: {', '.join(sorted(names))}")
-    limits = BENCH_LIMIT
+    most = {"deg": PLACEMENT_DEG, "mm": PLACEMENT_MM}
+    sizes = {key: most[key.rpartition("_")[2]] for key in values}
     return Placement(
-        **{
-            key: _number(
-                f"{name}.{key}",
-                value,
-                *(
-                    (-limits.placement_deg, limits.placement_deg)
-                    if key.endswith("_deg")
-                    else (-limits.placement_mm, limits.placement_mm)
-                ),
-            )
-            for key, value in values.items()
-        }
+        **{k: _number(f"{name}.{k}", v, -sizes[k], sizes[k]) for k, v in values.items()}
     )
 
 
@@ -249,7 +210,7 @@ class Bench:
         placed = inverse(request.tibial.matrix()) @ knee_pose(request.coordinates())
         placed = placed @ request.femoral.matrix()
         if height is not None:
-            placed[1, 3] = height(placed) - BENCH_LIMIT.first_penetration
+            placed[1, 3] = height(placed) - FIRST_PENETRATION
         coordinates = knee_coordinates(placed)
         scene = like.scene
         assert scene.contact is not None

@@ -24,7 +24,7 @@ from tkamb.run.guard import unforeseen_words
 from tkamb.run.known_errors import NOT_MEASURED, ContactSituation, as_json, stated_error
 from tkamb.run.read_scene import SharedState, recording_of
 from tkamb.run.recording import Recording
-from tkamb.show.view.bench import BENCH_LIMIT, ROWS, Bench, BenchRequest
+from tkamb.show.view.bench import KEPT_MODELS, MOST_THREADS, ROWS, Bench, BenchRequest
 from tkamb.show.view.bench_scene import write_bench
 from tkamb.studies.designs.design import DESIGN_FILE, load_design
 from tkamb.studies.designs.insert import Insert
@@ -204,7 +204,7 @@ class LiveKnee:
             if key in self._refused:
                 raise self._refused.pop(key)
             if key not in self._threads:
-                if len(self._threads) >= BENCH_LIMIT.most_threads:
+                if len(self._threads) >= MOST_THREADS:
                     names = " and ".join(f"{name} at {mm:g} mm" for name, mm, _ in self._threads)
                     return f"preparing {names}, then {request.contact}"
                 thread = Thread(target=self._prepare, args=(request, key), daemon=True)
@@ -305,10 +305,10 @@ class LiveKnee:
         return recording
 
     def _forget(self) -> None:
-        for old in [*self._recordings][: -BENCH_LIMIT.kept_models]:
+        for old in [*self._recordings][:-KEPT_MODELS]:
             del self._recordings[old]
             self._before.pop(old, None)
-        for old in [*self._refused][: -BENCH_LIMIT.kept_models]:
+        for old in [*self._refused][:-KEPT_MODELS]:
             del self._refused[old]
         needed = {thickness for _, _, thickness in (*self._recordings, *self._threads)}
         for inserts in (self._cases, self._shared):
