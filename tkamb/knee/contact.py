@@ -9,14 +9,13 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from tkamb.contact.model import CondyleWrench, ContactModel, ProbedContact
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.result import ContactStatus, Guess
 from tkamb.errors import ComputationError, InputError
 from tkamb.geometry.compiled import compiled_as_written
-from tkamb.geometry.frames import Array, displaced, pose
+from tkamb.geometry.frames import Array, displaced
 from tkamb.knee.unknowns import CONTACT_POINT
 
 
@@ -277,19 +276,6 @@ def _plus(a: Vector, factor: float, b: Vector) -> Vector:
 def _cross(a: Vector, b: Vector) -> Vector:
     x, y, z = a
     return y * b[2] - z * b[1], z * b[0] - x * b[2], x * b[1] - y * b[0]
-
-
-def batch_differences(
-    wrenches: Callable[[Array], Array], femur_pose: Array, settings: DifferenceSettings
-) -> Array:
-    """Return the result of `differences` for a function of many poses (n, 4, 4) at once."""
-    sizes = settings.step * np.array([1.0, 1.0, 1.0, *np.full(3, 1.0 / settings.arm)])
-    steps = np.concatenate([np.diag(sizes), -np.diag(sizes)])
-    rotations = Rotation.from_rotvec(steps[:, 3:]).as_matrix()
-    values = wrenches(
-        pose(rotations @ femur_pose[:3, :3], rotations @ femur_pose[:3, 3] + steps[:, :3])
-    )
-    return ((values[:6] - values[6:]) / (2.0 * sizes[:, None])).T
 
 
 def differences(

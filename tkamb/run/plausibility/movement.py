@@ -236,28 +236,27 @@ class SignSettings:
 SIGN = SignSettings()
 
 
-def sign_questions(case: Case, settings: SignSettings | None = None) -> Iterator[Question]:
+def sign_questions(case: Case) -> Iterator[Question]:
     """Ask about the signs of AP, axial rotation and adduction of the recorded poses."""
-    settings = SignSettings() if settings is None else settings
     contact = case.scene.contact
     free = set(KNEE_COORDINATES) if contact is None else set(contact.released)
     if case.femoral is None or case.insert is None or {"ap", "axial_rotation"} <= free:
         return
     coordinates = case.motion.coordinates
-    if case.motion.unrecorded or len(coordinates) < settings.frames:
+    if case.motion.unrecorded or len(coordinates) < SIGN.frames:
         return
     from tkamb.geometry.condyles import condyle_split
     from tkamb.geometry.first_touch import FirstTouch
 
-    rows = np.linspace(0, len(coordinates) - 1, settings.frames).astype(int)
+    rows = np.linspace(0, len(coordinates) - 1, SIGN.frames).astype(int)
     clearance = FirstTouch(case.femoral, case.insert, condyle_split(case.femoral))
     recorded = _gaps(clearance, coordinates[rows])
     if not np.isfinite(recorded).all():
         return
     rides = float(recorded.mean(axis=1).std())
-    if not free & {"ap", "si"} and rides > settings.ap_spread:
+    if not free & {"ap", "si"} and rides > SIGN.ap_spread:
         flipped = float(_turned_gaps(clearance, coordinates[rows], "ap").mean(axis=1).std())
-        if flipped < settings.ap_share * rides:
+        if flipped < SIGN.ap_share * rides:
             yield Question(
                 f"the femur rides up and down by {rides / MILLIMETRE:.1f} mm (rms) over the "
                 f"insert, by {flipped / MILLIMETRE:.1f} mm with the sign of AP turned: is "
@@ -267,13 +266,13 @@ def sign_questions(case: Case, settings: SignSettings | None = None) -> Iterator
             )
             return
     tilts = _difference(recorded)
-    if free & {"axial_rotation", "adduction"} or tilts < settings.turn_spread:
+    if free & {"axial_rotation", "adduction"} or tilts < SIGN.turn_spread:
         return
     flipped = min(
         _difference(_turned_gaps(clearance, coordinates[rows], name))
         for name in ("axial_rotation", "adduction")
     )
-    if flipped < settings.turn_share * tilts:
+    if flipped < SIGN.turn_share * tilts:
         yield Question(
             f"the condyles' gaps differ by {tilts / MILLIMETRE:.2f} mm (rms about their mean), "
             f"by {flipped / MILLIMETRE:.2f} mm with the sign of axial rotation, or of adduction, "
