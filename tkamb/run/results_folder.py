@@ -70,12 +70,12 @@ def read_results(directory: str | Path, *, check: bool = True) -> Results:
         if name in columns and not np.isfinite(np.asarray(columns[name], float)).all():
             raise InputError(f"'{name}' is not a number", directory / CSV_NAME, "run it again")
     summary = read_summary(directory)
+    if check and (changes := differences(directory, summary)):
+        raise InputError(changes[0], directory, "`tkamb verify` lists all changes; run it again")
     frames, complete = len(next(iter(columns.values()))), not summary.get("unfinished_frames")
     maps, button = (
         _read_maps(directory / name, frames if complete else 0) for name in (MAPS_NAME, BUTTON_NAME)
     )
-    if check and (changes := differences(directory, summary)):
-        raise InputError(changes[0], directory, "`tkamb verify` lists all changes; run it again")
     has_bands = (directory / BANDS_NAME).exists()
     bands = read_bands(directory / BANDS_NAME) if has_bands else {}
     return Results(columns, summary, maps, directory, bands, button)
