@@ -172,7 +172,7 @@ def other_knee(plain, model, left, plane):
         replace(item, proximal=moved(item.proximal, left), distal=moved(item.distal, left))
         for item in plain.ligaments
     ]
-    button_contact = plain.button_contact
+    button_contact, method = plain.button_contact, plain.patella
     muscle, line = plain.extensor.quadriceps, plain.extensor.patellar_ligament
     extensor = tkamb.Extensor(
         replace(muscle, points=tuple(moved(point, left) for point in muscle.points)),
@@ -195,4 +195,6 @@ def other_knee(plain, model, left, plane):
         frames=NAMES,
         joints=["knee_free"],
         patellofemoral_contact=None if button_contact is None else button_contact.contact.model,
+        released_patella=() if method is None else method.released,
+        head_shares=None if method is None else {one.name: one.share for one in method.heads},
     )

@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 import tkamb
+from released_patella import SLACK
 from scenes import MODEL
+from tkamb.geometry.frames import PATELLA_BODY_COORDINATES
 from tkamb.geometry.surface import Surface
 
 CHOICE = {"contact.model": "foundation", "contact.patellofemoral.model": "foundation"}
@@ -18,7 +20,16 @@ def read_plane():
     return tkamb.read_scene(tkamb.load_scene(MODEL / "scene.toml", CHOICE))
 
 
-def body_knee(plain, model="foundation", femoral=None, button=None, resolution=1e-3, even=False):
+def body_knee(
+    plain,
+    model="foundation",
+    femoral=None,
+    button=None,
+    resolution=1e-3,
+    even=False,
+    released=False,
+    **more,
+):
     """Return a knee with three heads, two strands and two retinacula.
 
     Args:
@@ -27,7 +38,15 @@ def body_knee(plain, model="foundation", femoral=None, button=None, resolution=1
         femoral, button: other surfaces; None: those of `plain`.
         resolution: m.
         even: whether the lines are symmetric about the sagittal plane.
+        released: whether the forces of the patella act in all results.
+        more: other arguments of `tkamb.Knee`.
     """
+    if released:
+        size = sum(HEADS.values())
+        more |= {
+            "released_patella": PATELLA_BODY_COORDINATES,
+            "head_shares": {name: tension / size for name, tension in HEADS.items()},
+        }
     muscle, line = plain.extensor.quadriceps, plain.extensor.patellar_ligament
     origin, insertion = (np.array(point.position) for point in muscle.points)
     proximal, distal = np.array(line.proximal.position), np.array(line.distal.position)
@@ -54,7 +73,7 @@ def body_knee(plain, model="foundation", femoral=None, button=None, resolution=1
             tkamb.LinkPoint("femur", np.array([0.0, 0.0, side * 0.042])),
             tkamb.LinkPoint("patella", np.array([0.002, 0.0, side * 0.018])),
             tkamb.TwoLine(stiffness=2e4),
-            slack_length=0.050,
+            slack_length=1e-3 * SLACK,
         )
 
     return tkamb.Knee(
@@ -71,6 +90,7 @@ def body_knee(plain, model="foundation", femoral=None, button=None, resolution=1
         ],
         muscles=[head("vastus_medialis", -1.0, 0.020), head("vastus_lateralis", 1.0, lateral)],
         patellofemoral_contact=tkamb.contact_model(model, resolution=resolution),
+        **more,
     )
 
 

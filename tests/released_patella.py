@@ -2,15 +2,18 @@
 
 from tkamb.geometry.frames import PATELLA_BODY_COORDINATES
 
+SLACK = 58.3
+"""mm: slack length of the retinacula, their length with the plane patella in extension."""
 
-def bundle(name, proximal, distal, stiffness):
+
+def bundle(name, proximal, distal, stiffness, slack=50.0):
     return {
         "name": name,
         "proximal": {"link": proximal[0], "point_mm": list(proximal[1:])},
         "distal": {"link": distal[0], "point_mm": list(distal[1:])},
         "law": "two-line",
         "stiffness_N_per_mm": stiffness,
-        "slack_length_mm": 50.0,
+        "slack_length_mm": slack,
     }
 
 
@@ -35,8 +38,18 @@ RELEASED = {
         bundle("strand_medial", ("patella", 6.0, -21.0, -8.0), ("tibia", 38.0, 392.8, -2.0), 400.0),
         bundle("strand_lateral", ("patella", 6.0, -21.0, 8.0), ("tibia", 38.0, 392.8, 8.0), 400.0),
         bundle(
-            "retinaculum_medial", ("femur", 0.0, 0.0, -42.0), ("patella", 2.0, 0.0, -18.0), 20.0
+            "retinaculum_medial",
+            ("femur", 0.0, 0.0, -42.0),
+            ("patella", 2.0, 0.0, -18.0),
+            20.0,
+            SLACK,
         ),
-        bundle("retinaculum_lateral", ("femur", 0.0, 0.0, 42.0), ("patella", 2.0, 0.0, 18.0), 20.0),
+        bundle(
+            "retinaculum_lateral",
+            ("femur", 0.0, 0.0, 42.0),
+            ("patella", 2.0, 0.0, 18.0),
+            20.0,
+            SLACK,
+        ),
     ],
 }

@@ -12,7 +12,6 @@ from tkamb.geometry.frames import PATELLA_BODY_COORDINATES, inverse
 from tkamb.knee.patella_body import (
     SCALE,
     Head,
-    PatellaBody,
     coordinates_of,
     patella_pose,
     sides_without_head,
@@ -33,13 +32,11 @@ def knee(plain):
 
 def body_at(knee, q, tensions=HEADS):
     """Return the forces on the patella at a configuration."""
-    from tkamb.knee.patella_equilibrium import _heads
+    from tkamb.knee.patella_equilibrium import patella_method
 
     poses = knee._link_poses(knee._kinematics(knee.create_data(), q), None)
-    joint = knee.chain.patella_joint_in_femur
-    button = knee.button_contact
-    heads = _heads(knee, tensions)
-    return PatellaBody(button, button.contact.probe(), joint, heads, knee._others, poses)
+    method = patella_method(knee, None, PATELLA_BODY_COORDINATES)
+    return method.body_of_heads(poses, tensions)
 
 
 def as_array(result):

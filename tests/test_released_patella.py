@@ -1,6 +1,7 @@
 """Scenes with [patella] released: the patella in six degrees of freedom in the frames of a run."""
 
 import copy
+import re
 
 import numpy as np
 import pytest
@@ -40,11 +41,8 @@ def coordinates(results):
     return np.array([results[f"patella_{name}_{unit}"] for name, unit in names]).T
 
 
-def test_the_plane_results_do_not_change(results, tmp_path):
-    plane = tkamb.simulate(write_scene(tmp_path), frames=FRAMES)
-    for name, values in plane.columns.items():
-        if name != "status" and not name.endswith("_seconds"):
-            assert np.array_equal(values, results.columns[name], equal_nan=True), name
+def test_a_plane_patella_has_no_columns_of_a_released_one(tmp_path):
+    plane = tkamb.simulate(write_scene(tmp_path), frames=slice(40, 41))
     assert not any(name.startswith(("patella_tilt", "patella_line")) for name in plane.columns)
 
 
@@ -52,9 +50,13 @@ def test_the_patella_is_in_equilibrium_in_every_frame(results):
     assert not any("patella:" in status for status in results.status)
     assert (results["patella_residual_N"] <= 1e-6 * results["quadriceps_N"]).all()
     assert np.isfinite(coordinates(results)).all()
-    # The strands carry the pull of the patellar ligament, but the equations keep the plane patella.
+    # The patellar ligament of the equations is the resultant of its strands, which spread a little.
     strands = sum(results[f"patella_line_strand_{side}_N"] for side in ("medial", "lateral"))
-    assert strands[1:] == pytest.approx(results["patellar_ligament_N"][1:], rel=0.15)
+    assert strands == pytest.approx(results["patellar_ligament_N"], rel=0.01)
+    assert (strands >= results["patellar_ligament_N"]).all()
+    # The patellofemoral force of the equations is that of the contact, which is frictionless.
+    assert results["patellofemoral_N"] == pytest.approx(results["button_force_N"], rel=1e-6)
+    assert (results["button_imbalance_N"] <= 1e-6 * results["quadriceps_N"]).all()
 
 
 def test_a_run_and_the_object_find_the_same_patella(scene, results):
@@ -68,7 +70,7 @@ def test_a_run_and_the_object_find_the_same_patella(scene, results):
                 for end in ("proximal", "distal")
             ),
             tkamb.TwoLine(stiffness=1e3 * one["stiffness_N_per_mm"]),
-            slack_length=0.05,
+            slack_length=1e-3 * one["slack_length_mm"],
         )
         for one in RELEASED["ligament"]
     ]
@@ -140,22 +142,13 @@ def test_released_coordinates_are_those_of_the_scene(tmp_path):
     assert abs(results["patella_tilt_deg"][0]) > 1e-3
 
 
-def test_held_coordinates_do_not_come_from_the_frame_before(tmp_path):
-    held = released_scene(tmp_path, released=["tilt", "rotation"])
-    together = coordinates(tkamb.simulate(held, frames=slice(30, 71, 40)))
-    alone = coordinates(tkamb.simulate(held, frames=slice(70, 71)))
-    assert together[1] == pytest.approx(alone[0], abs=1e-5)
-    assert abs(together[1, 0] - together[0, 0]) > 1.0
-
-
-def test_a_patella_with_a_held_plane_is_flagged_if_its_contact_does_not_fit(scene, tmp_path):
-    held = released_scene(tmp_path, released=["ap", "tilt"])
-    results = tkamb.simulate(held, frames=slice(70, 71))
-    force, off = results["patellofemoral_N"][0], results["button_imbalance_N"][0]
-    assert off > 0.5 * force
-    assert f"differs by {off:.0f} N from the patellofemoral force" in results.status[0]
-    whole = tkamb.simulate(scene, frames=slice(70, 71))
-    assert "from the patellofemoral force" not in whole.status[0]
+def test_a_frame_does_not_depend_on_the_frame_before(scene):
+    """One frame after another frame, and alone: pose and tension are solved to the end."""
+    together = tkamb.simulate(scene, frames=slice(30, 71, 40))
+    alone = tkamb.simulate(scene, frames=slice(70, 71))
+    assert coordinates(together)[1] == pytest.approx(coordinates(alone)[0], abs=1e-6)
+    for name in ("quadriceps_N", "patellar_ligament_N", "patellofemoral_N", "force_total_N"):
+        assert together[name][1] == pytest.approx(alone[name][0], rel=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -164,6 +157,7 @@ def test_a_patella_with_a_held_plane_is_flagged_if_its_contact_does_not_fit(scen
         ({"ligament": []}, "released"),
         ({"head": RELEASED["head"][:2]}, "do not sum to 1"),
         ({"released": ["tild"]}, "released"),
+        ({"released": ["ap", "tilt"]}, "needs ap, si and flexion"),
         ({"ligament": RELEASED["ligament"][2:]}, "patella to the tibia"),
         ({"ligament": RELEASED["ligament"] * 2}, "named twice"),
         ({"ligament": [*STRANDS, INSIDE]}, "inside: has both ends on the patella"),
@@ -181,9 +175,9 @@ def test_a_lost_patella_is_in_the_status(tmp_path):
     """Strands of 290 mm are slack: nothing holds the patella against the quadriceps."""
     slack = [one | {"slack_length_mm": 290.0} for one in RELEASED["ligament"]]
     results = tkamb.simulate(released_scene(tmp_path, ligament=slack), frames=slice(50, 51))
-    assert "patella: " in results.status[0] and not results.status[0].startswith("failed")
+    assert results.status[0].startswith("failed: patella: ")
     assert np.isnan(coordinates(results)).all() and np.isnan(results["button_force_N"][0])
-    assert np.isfinite(results["force_total_N"][0])
+    assert np.isnan(results["force_total_N"][0])
 
 
 def test_check_describes_the_released_patella(tmp_path):
@@ -260,8 +254,8 @@ def test_a_patella_that_its_lines_lift_off_is_in_the_status(tmp_path):
         bundle(f"lift_{k}", ("femur", 103.0, y, z), ("patella", 8.0, y, z), 200.0)
         for k, (y, z) in enumerate(((15.0, 0.0), (-10.0, -10.0), (-10.0, 10.0)))
     ]
-    held = {"released": ["ap"], "ligament": [*RELEASED["ligament"], *lifts]}
-    results = tkamb.simulate(released_scene(tmp_path, **held), frames=slice(5, 6))
+    lines = [*RELEASED["ligament"], *lifts]
+    results = tkamb.simulate(released_scene(tmp_path, ligament=lines), frames=slice(5, 6))
     assert "the button is not in contact" in results.status[0]
     assert np.isnan(coordinates(results)).all() and np.isnan(results["button_force_N"][0])
 
@@ -293,3 +287,70 @@ def test_live_leaves_the_patella_out(scene, tmp_path):
             assert mine.numbers[name] == pytest.approx(value, rel=1e-9, nan_ok=True), name
     results = tkamb.simulate(released.save(released.recorded(40), tmp_path / "kept"))
     assert not any(name.startswith("button") for name in results.columns)
+
+
+@pytest.mark.parametrize("released", [(), ("ap", "ml", "axial_rotation", "adduction")])
+def test_muscles_of_the_leg_pull_the_released_patella(released):
+    """Static optimisation, equations and patella agree on the tension of the quadriceps."""
+    from scenes import MODEL
+    from shared_trials import two_flexors
+    from tkamb.io.scene.case import load_case
+    from tkamb.run.muscles.shared_muscles import SharedMuscles
+    from tkamb.run.read_scene import recording_of
+
+    choice = {f"patella.{key}": value for key, value in RELEASED.items()}
+    choice |= {"contact.model": "foundation", "contact.patellofemoral": BUTTON}
+    if released:
+        choice["contact.released"] = list(released)
+    recording = recording_of(load_case(tkamb.load_scene(MODEL / "scene.toml", choice)))
+    trial = two_flexors(len(recording.motion), least=0.02)
+    recording.muscles = SharedMuscles(trial)
+    for k in (40, 60):
+        frame = recording.frame(k)
+        assert not frame.failures
+        tension = frame.geometry.extensor.tension(frame.loads.values)
+        shared = recording.muscles.frame(k).tension(frame.geometry.share)
+        assert frame.geometry.extensor.released.tension == pytest.approx(tension, rel=1e-7)
+        assert shared == pytest.approx(tension, rel=1e-4 if released else 1e-7)
+        assert frame.patella.balance.residual <= 1e-6 * tension
+
+
+def moved_z(table, end, z):
+    point = [*table[end]["point_mm"][:2], z]
+    return table | {end: table[end] | {"point_mm": point}}
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (
+            {"head": [*RELEASED["head"][:2], moved_z(RELEASED["head"][2], "insertion", -12.0)]},
+            r"lateral insertion, 12 mm medial",
+        ),
+        (
+            {
+                "ligament": [
+                    *RELEASED["ligament"][:3],
+                    moved_z(RELEASED["ligament"][3], "proximal", -42.0),
+                ]
+            },
+            r"retinaculum_lateral distal: its other end, 42 mm medial",
+        ),
+        (
+            {"ligament": [one | {"slack_length_mm": 48.0} for one in RELEASED["ligament"]]},
+            r"retinaculum_\w+ .*strain beyond 15 %",
+        ),
+    ],
+)
+def test_check_asks_about_unlikely_lines_of_the_patella(tmp_path, changes, words):
+    from tkamb.io.scene.case import load_case
+    from tkamb.run.plausibility.plausibility import Plausibility
+    from tkamb.run.read_scene import recording_of
+
+    texts = []
+    for number, change in enumerate(({}, changes)):
+        case = load_case(tkamb.load_scene(released_scene(tmp_path / str(number), **change)))
+        questions = Plausibility(case, recording_of(case)).questions
+        texts.append(" ".join(question.text for question in questions))
+    assert not re.search(words, texts[0])
+    assert re.search(words, texts[1]), texts[1]

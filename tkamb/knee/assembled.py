@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from tkamb.knee.extensor import ExtensorLines
     from tkamb.knee.ligaments import Ligament
     from tkamb.knee.patella import PatellaState
+    from tkamb.knee.patella_frame import PatellaMethod
 
 
 # 1: largest error of a quaternion's norm. An error of this size changes a force by
@@ -125,11 +126,14 @@ class AssembledKnee:
         joints: Sequence[str] = (),
         cache: bool = False,
         patellofemoral_contact: "ContactModel | str | None" = None,
+        released_patella: Sequence[str] = (),
+        head_shares: Mapping[str, float] | None = None,
     ) -> None:
         must_be(model, pin.Model, "Knee: model", "give a pin.Model")
         must_be(implant, (Implant, NoneType), "Knee: implant", "give a tkamb.Implant")
         must_be(extensor, (Extensor, NoneType), "Knee: extensor", "give a tkamb.Extensor")
         must_be(frames, (Mapping, NoneType), "Knee: frames", "give part -> name of a frame")
+        must_be(head_shares, (Mapping, NoneType), "Knee: head_shares", "give head -> share")
         if side not in ("right", "left"):
             raise InputError(f"side {side!r}", "Knee", "give 'right' or 'left'")
         self.friction = real_number(friction, "Knee: friction", "give 0 to 1")
@@ -167,6 +171,14 @@ class AssembledKnee:
             self.button_contact = prepared_button(
                 patellofemoral_contact, self.implant, self._surfaces, self.chain, cache
             )
+        self.patella: PatellaMethod | None = None
+        self._has_own_patella_lines = bool(released_patella)
+        if released_patella:
+            from tkamb.knee.patella_equilibrium import released_method
+
+            self.patella = released_method(self, released_patella, head_shares)
+        elif head_shares is not None:
+            raise InputError("needs released_patella=", "head_shares", "give it to the knee")
         self._identity = _identity(self)
 
     def _set_ligaments(self, bundles: "Iterable[Ligament]") -> None:
@@ -182,6 +194,21 @@ class AssembledKnee:
         """Return the same knee with other ligaments; everything else is shared."""
         other = copy.copy(self)
         other._set_ligaments(ligaments)
+        if other.patella is not None and other._has_own_patella_lines:
+            other.patella = replace(other.patella, lines=other._others)
+        return other
+
+    @property
+    def _instant_ligaments(self) -> "tuple[Ligament, ...]":
+        """The ligaments of the equations, without those of a released patella."""
+        if self.patella is None or not self._has_own_patella_lines:
+            return self.ligaments
+        return tuple(bundle for bundle in self.ligaments if bundle not in self._others)
+
+    def _with_patella(self, patella: "PatellaMethod") -> Self:
+        """Return the same knee with a released patella; everything else is shared."""
+        other = copy.copy(self)
+        other.patella = patella
         return other
 
     def with_contact(self, model: "ContactModel | str") -> Self:
@@ -271,7 +298,12 @@ class AssembledKnee:
 
     def _loads_patella(self, tensions: Mapping[str, float]) -> bool:
         """Return whether the extensor mechanism pulls, or a ligament ends on the patella."""
-        return bool(self._others) or self._pulls(tensions)
+        return bool(self._plane_lines) or self._pulls(tensions)
+
+    @property
+    def _plane_lines(self) -> "tuple[Ligament, ...]":
+        """The ligaments that end on the patella, unless it is released."""
+        return self._others if self.patella is None else ()
 
     def _loads_beside(
         self,
@@ -287,10 +319,10 @@ class AssembledKnee:
             tensions: muscle -> tension, N.
         """
         poses, total = self._link_poses(kinematics, patella), list[PointForces]()
-        if self._others:
+        if self._plane_lines:
             from tkamb.knee.ligaments import ligament_loads
 
-            total += ligament_loads(self._others, poses)[1]
+            total += ligament_loads(self._plane_lines, poses)[1]
         if self._pulls(tensions):
             assert patella is not None and self.extensor_lines is not None
             quadriceps = tensions[self._extensor_names[0]]
@@ -428,10 +460,25 @@ class AssembledKnee:
         return (self.extensor.quadriceps.name, PATELLAR_LIGAMENT) if self.extensor else ()
 
     def _pulls(self, tensions: Mapping[str, float]) -> bool:
-        return self.extensor is not None and tensions.get(self._extensor_names[0], 0.0) != 0
+        names = self._extensor_names[:1]
+        if self.patella is not None:
+            names += tuple(head.name for head in self.patella.heads)
+        return any(tensions.get(name, 0.0) != 0 for name in names)
 
     def _tensions(self, tensions: Mapping[str, float] | float | None) -> dict[str, float]:
-        return checked_tensions(tensions, self._extensor_names, self._lines)
+        if self.patella is None:
+            return checked_tensions(tensions, self._extensor_names, self._lines)
+        heads = tuple(head.name for head in self.patella.heads)
+        (main,) = self._extensor_names[:1]
+        is_total = tensions is not None and not isinstance(tensions, Mapping)
+        given = checked_tensions(tensions, (main,), dict.fromkeys((*heads, *self._lines)))
+        if not is_total and main in heads:
+            return given
+        # A number is the tension of the whole quadriceps, and so is the name of a line that is no
+        # head: the heads share it.
+        total = given.pop(main, 0.0)
+        shared = self.patella.head_tensions(total)
+        return {name: given.get(name, 0.0) + shared.get(name, 0.0) for name in (*heads, *given)}
 
     def _find_patella(self, kinematics: KneePose, data: KneeData) -> "PatellaState":
         lines = self.extensor_lines

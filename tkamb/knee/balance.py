@@ -389,6 +389,39 @@ class _Search:
         )
 
 
+# 1: residual over a load at which the steps after a search end.
+SMALL_RESIDUAL = 1e-10
+# 1: steps of Newton's method after a search. Not studied.
+MAX_STEPS = 12
+# 1: halvings of such a step until the residual falls. Not studied.
+MAX_HALVINGS = 6
+
+
+def polished(forces: Forces, start: Array, size: float) -> tuple[Array, Trial]:
+    """Return the coordinates of the smallest residual that Newton's method finds, and its trial.
+
+    Args:
+        forces: function of a search.
+        start: coordinates (n,) near the equilibrium, m.
+        size: load to which the residual is compared, N.
+    """
+    x, last = start, forces(start)
+    for _ in range(MAX_STEPS):
+        small = np.abs(last.force).max() <= SMALL_RESIDUAL * size
+        if small or last.stiffness is None:
+            break
+        step = np.linalg.solve(last.stiffness, last.force)
+        for _ in range(MAX_HALVINGS):
+            closer = forces(x + step)
+            if np.linalg.norm(closer.force) < np.linalg.norm(last.force):
+                break
+            step = 0.5 * step
+        else:
+            break
+        x, last = x + step, closer
+    return x, last
+
+
 def newton_step(stiffness: Array, force: Array) -> Array | None:
     """Return Newton's step (n,), m; None if the stiffness is singular."""
     try:

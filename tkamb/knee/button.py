@@ -70,6 +70,7 @@ class ButtonPress:
 
     Args:
         force: patellofemoral force of the equations on the patella, insert frame, shape (3,), N.
+            Of a released patella: the force that its lines require of the contact.
         pose: pose_button_in_insert of the contact, shape (4, 4).
         contact: the contact in the button frame. "Insert" in the names of `ContactResult` means
             the button. None: there is no contact, see `problem`.
@@ -111,6 +112,16 @@ class ButtonPress:
         force = rotate(self.pose, wrench[:3])
         moment = rotate(self.pose, wrench[3:]) + np.cross(self.pose[:3, 3], force)
         return np.concatenate([force, moment])
+
+    @property
+    def centre(self) -> Array:
+        """Centre of pressure of both facets, insert frame, shape (3,), m; NaN without contact."""
+        facets = [facet for facet in self.facets.values() if facet is not None]
+        if not facets:
+            return np.full(3, np.nan)
+        places = [facet.centre_of_pressure for facet in facets]
+        force = [facet.force for facet in facets]
+        return transform(self.pose, np.average(places, axis=0, weights=force))
 
     @cached_property
     def imbalance(self) -> float:

@@ -29,6 +29,7 @@ from tkamb.geometry.frames import (
     MIRROR,
     PATELLA_JOINT_NAMES,
     Array,
+    cross_matrix,
     knee_coordinates,
     mirrored_pose,
 )
@@ -55,6 +56,12 @@ _TWIST_MIRROR = np.array([1.0, 1.0, -1.0, -1.0, -1.0, 1.0])
 def mirrored_spatial(vector: Array) -> Array:
     """Return twists or wrenches (..., 6) of the mirror image in the sagittal plane."""
     return np.asarray(vector * _TWIST_MIRROR)
+
+
+def force_cross(twists: Array, wrench: Array) -> Array:
+    """Return xi x* w (6, n) of twists xi (6, n) and a wrench w (6,)."""
+    force, moment = cross_matrix(wrench.reshape(2, 3))
+    return -np.concatenate([force @ twists[3:], moment @ twists[3:] + force @ twists[:3]])
 
 
 def se3(pose: Array) -> pin.SE3:

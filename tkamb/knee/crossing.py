@@ -237,9 +237,14 @@ def yielding_flexion_row(
 
 
 def tension_by_ligament(geometry: KneeGeometry) -> tuple[float, float]:
-    """Return a (1) and b (N) of Q = a T + b from the three equations of the patella."""
+    """Return a (1) and b (N) of Q = a T + b from the three equations of the patella.
+
+    A released patella has the ratio a of its equilibrium.
+    """
     extensor, state = geometry.extensor, geometry.state
     assert extensor is not None
+    if extensor.released is not None:
+        return extensor.released.tension / extensor.released.forces["patellar_ligament"], 0.0
     femur_ml = state.pose("femur")[:3, 2]
     contact_forces = unknowns.patellofemoral(
         extensor.contact_point, extensor.contact_normal, femur_ml

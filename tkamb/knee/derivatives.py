@@ -44,7 +44,7 @@ import pinocchio as pin
 
 from tkamb.geometry.frames import Array, cross_matrix, displaced
 from tkamb.knee.anatomy import FixedFrame
-from tkamb.knee.canonical import KneePose, mirrored_spatial, summed
+from tkamb.knee.canonical import KneePose, force_cross, mirrored_spatial, summed
 
 if TYPE_CHECKING:
     from tkamb.knee.assembled import KneeData
@@ -95,10 +95,15 @@ def forces_and_derivatives(
     if knee.contact is not None:
         knee.contact.check_differentiable()
     muscle_tensions = knee._tensions(tensions)
+    heads = {} if knee.patella is None else knee._take_heads(muscle_tensions)
     twists = relative_twists(knee, q, data, knee._loads_patella(muscle_tensions))
     kinematics = knee._kinematics(data, q, v)
     wrenches, by_q, by_v = _between(knee, data, kinematics, twists, q, v)
     beside, slopes = _beside(knee, data, kinematics, muscle_tensions, twists)
+    if heads:
+        beside, slopes = _with_released_patella(
+            knee, data, kinematics, heads, twists, beside, slopes
+        )
     for link, wrench in beside.items():
         wrenches[link] = wrenches[link] + wrench
         by_q[link] = by_q[link] + slopes[link]
@@ -119,12 +124,6 @@ def forces_and_derivatives(
             line.add_derivatives(knee.model, data.data, tension, df_dq)
     on_joints = pin.StdVec_Force([pin.Force(force) for force in forces])
     return knee._with_lines(data, muscle_tensions, on_joints), df_dq, df_dv
-
-
-def force_cross(twists: Array, wrench: Array) -> Array:
-    """Return xi x* w (6, n) of twists xi (6, n) and a wrench w (6,)."""
-    force, moment = cross_matrix(wrench.reshape(2, 3))
-    return -np.concatenate([force @ twists[3:], moment @ twists[3:] + force @ twists[:3]])
 
 
 def relative_twists(
@@ -282,6 +281,31 @@ def _beside(
             change = _patella_slopes(knee, kinematics, patella) @ femur
         slopes = {link: slopes[link] + by_patella[link] @ change for link in LINKS}
     return wrenches, slopes
+
+
+def _with_released_patella(
+    knee: "Knee",
+    data: "KneeData",
+    kinematics: KneePose,
+    heads: Mapping[str, float],
+    twists: RelativeTwists,
+    beside: Loads,
+    slopes: Loads,
+) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Return the result of `_beside` with the loads of a released patella added."""
+    from tkamb.knee.patella_equilibrium import pulled_tibia, pulled_tibia_slope
+
+    button = knee.button_contact
+    assert knee.patella is not None and button is not None
+    button.contact.check_differentiable()
+    wrench, body, coordinates, stiffness = pulled_tibia(knee, kinematics, heads, data)
+    slope = pulled_tibia_slope(body, coordinates, stiffness, knee.patella.released)
+    slope = slope @ _users(knee, twists.femur)
+    total, change = dict(beside), dict(slopes)
+    for link, sign in (("tibia", 1.0), ("femur", -1.0)):
+        total[link] = total.get(link, np.zeros(6)) + sign * wrench
+        change[link] = change.get(link, np.zeros_like(slope)) + sign * slope
+    return total, change
 
 
 def _slopes_beside(

@@ -5,6 +5,9 @@ unknowns: hip force and moment (6), one muscle, patellar ligament, patellofemora
 and lateral normal force, and three residuals. A smaller model has other unknowns:
 
 - Without muscles the chain has no patella, and the flexion moment is an additional residual.
+- With a released patella the extensor mechanism is one unknown, the muscle's tension, as a pair of
+  wrenches on tibia and femur (`tkamb.knee.patella_frame`). The femur carries the patella's weight
+  and inertia.
 - Without contact a force and the coronal and axial moments act at the femoral origin. Without
   muscles the flexion moment acts there, too.
 """
@@ -32,6 +35,7 @@ from tkamb.knee.unknowns import (
 
 if TYPE_CHECKING:
     from tkamb.knee.crossing import MuscleShare
+    from tkamb.knee.patella_frame import PatellaLoads
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,8 @@ class Extensor:
         contact_normal: unit normal from femur to patella, in the sagittal plane, shape (3,).
         muscles: names of the extensor group, the muscles that insert on the patella.
         wrap: angle by which the extensor group wraps the femur, rad.
+        released: the released patella, whose contact force may leave the sagittal plane; None: the
+            patella moves in its plane.
     """
 
     patellar_ligament: tuple[PointForces, ...]
@@ -66,6 +72,7 @@ class Extensor:
     contact_normal: Array
     muscles: tuple[str, ...]
     wrap: float = 0.0
+    released: "PatellaLoads | None" = None
 
     def tension(self, values: Mapping[str, float]) -> float:
         """Return the tension (N) of the extensor group among solved loads; NaN if unsolved."""
@@ -207,7 +214,7 @@ def dome_sensitivity(
     would change by 1.6 % at most. The value for the quadriceps is therefore an upper estimate.
 
     Args:
-        geometry: the frame.
+        geometry: the frame. A released patella is replaced by the plane one.
         loads: solution of its equations.
         friction: Coulomb coefficient of the femorotibial contact.
 
@@ -220,6 +227,10 @@ def dome_sensitivity(
         return None
     if loads.slack:
         return 0.0, 0.0
+    if extensor.released is not None:
+        geometry = extensor.released.plane_of(geometry)
+        plane = solve_knee(geometry, friction)
+        return (np.nan, np.nan) if plane.problems else dome_sensitivity(geometry, plane, friction)
     without_known_loads = replace(
         geometry, share=None, ligaments=(), post=()
     )  # known loads do not change
@@ -276,6 +287,9 @@ class KneeSystem:
         values = self.solution.values
         flexion, adduction = self.external_moments()
         slack = [*map(muscle_load, self.slack), *PATELLAR] if self.slack else []
+        extensor = self.geometry.extensor
+        if extensor is not None and extensor.released is not None and not self.slack:
+            values = values | extensor.released.forces
         return SolvedLoads(
             values | dict.fromkeys(slack, 0.0),
             self.contact_force(values),
@@ -346,6 +360,10 @@ class KneeSystem:
             return []
         if self.slack:
             return unknowns.unloaded_patella(extensor.contact_point, state.pose("femur")[:3, 2])
+        if extensor.released is not None:
+            origin, femur_ml = state.pose("patella")[:3, 3], state.pose("femur")[:3, 2]
+            rest = unknowns.unloaded_patella(origin, femur_ml)
+            return [*self.geometry.muscles, *rest]
         return [
             *self.geometry.muscles,
             Unknown("patellar_ligament", extensor.patellar_ligament),

@@ -33,9 +33,8 @@ if TYPE_CHECKING:
     from tkamb.knee.adjustment import AdjustmentEffect
     from tkamb.knee.button import ButtonPress
     from tkamb.knee.contact import KneeContact
+    from tkamb.knee.found_patella import FoundPatella
     from tkamb.knee.knee import Knee
-    from tkamb.knee.patella_equilibrium import FoundPatella
-    from tkamb.knee.patella_frame import PatellaMethod
     from tkamb.knee.released import KneeEquilibrium, ReleasedKnee
     from tkamb.knee.starts import InitialPoses
 
@@ -186,7 +185,6 @@ class FrameMethod:
         post: surface of the insert's post, insert frame; None: not modelled.
         ready_cam: `cam` of another method with the same contact model, perhaps with another
             material; None: prepared here.
-        patella: how the patella moves in six degrees of freedom; None: in its plane.
     """
 
     knee: "Knee"
@@ -196,7 +194,6 @@ class FrameMethod:
     split_sensitivity: bool = True
     post: "Surface | None" = None
     ready_cam: "CamPost | None" = None
-    patella: "PatellaMethod | None" = None
 
     def of(self, knee: "Knee") -> "FrameMethod":
         """Return the same method for another knee."""
@@ -263,30 +260,24 @@ class FrameMethod:
         Args:
             before: starts of the earlier frames, for warm start and initial guess.
         """
+        last = before[-1] if before else FrameStart()
+        instant = replace(instant, patella_start=last.patella)
         frame, button = self._knee_frame(instant, before), self.knee.button_contact
         if button is None or frame.failures or frame.geometry.extensor is None:
             return frame
         from tkamb.knee.button import ButtonPress
 
         state, extensor = frame.geometry.state, frame.geometry.extensor
-        size = frame.loads.values.get("patellofemoral", NAN)
-        last = before[-1] if before else FrameStart()
-        force = size * extensor.contact_normal
-        began = clock.perf_counter()
-        if self.patella is None:
-            femur, patella = state.pose("femur"), state.pose("patella")
-            return replace(frame, button=button.pressed(femur, patella, force, last.button))
-        tension, found = extensor.tension(frame.loads.values), None
-        try:
-            found = self.patella.at(frame.geometry, tension, force, last.patella)
-            problem = found.problem
-        except ComputationError as error:
-            problem = f"patella: {error.what}"
-        press = found.press if found else None
-        if press is None:
-            press = ButtonPress(force, np.full((4, 4), NAN), problem=problem)
-        press = replace(press, seconds=clock.perf_counter() - began)
-        return replace(frame, button=press, patella=found)
+        if extensor.released is not None:
+            found = extensor.released.found
+            return replace(frame, button=found.press if found else None, patella=found)
+        if self.knee.patella is not None:
+            problem = "patella: no tension of the quadriceps pulls it"
+            press = ButtonPress(np.full(3, NAN), np.full((4, 4), NAN), problem=problem)
+            return replace(frame, button=press)
+        force = frame.loads.values.get("patellofemoral", NAN) * extensor.contact_normal
+        femur, patella = state.pose("femur"), state.pose("patella")
+        return replace(frame, button=button.pressed(femur, patella, force, last.button))
 
     def _knee_frame(self, instant: Instant, before: Sequence[FrameStart]) -> Frame:
         """Return loads and femorotibial contact at an instant."""
@@ -470,7 +461,7 @@ class FrameMethod:
             frame = replace(frame, loads=unsolved([frame.problem]))
         else:
             geometry = self._equilibrium_geometry(instant, knee, frame.contact, points)
-            loads = solve_knee(geometry, instant.friction)
+            geometry, loads = instant.solved_with_muscles(geometry)
             frame = replace(frame, geometry=geometry, loads=loads)
         frame = replace(frame, seconds=clock.perf_counter() - began)
         if frame.loads.problems:

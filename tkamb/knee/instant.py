@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from tkamb.knee.extensor import ExtensorLines
     from tkamb.knee.ligaments import Ligament
     from tkamb.knee.patella import PatellaState
+    from tkamb.knee.patella_frame import PatellaMethod
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +133,9 @@ class Instant:
         two_condyles: whether the femoral component has two condyles.
         ground: external load on the shank; None: no load.
         muscles: muscles of the leg that share the load; None: the quadriceps alone acts.
+        patella: how the released patella is found; None: the patella moves in its plane.
+        patella_start: coordinates (6,) of the released patella at a neighbouring instant; None:
+            unknown.
     """
 
     chain: Chain
@@ -145,6 +149,8 @@ class Instant:
     two_condyles: bool
     ground: PointForces | None = None
     muscles: SharingMuscles | None = None
+    patella: "PatellaMethod | None" = None
+    patella_start: Array | None = None
 
     @property
     def sides(self) -> set[str]:
@@ -220,13 +226,32 @@ class Instant:
         return contact_points(query, pose, lambda point: self.sliding(self.coordinates, point))
 
     def solved(self, geometry: KneeGeometry) -> tuple[KneeGeometry, SolvedLoads]:
-        """Return a geometry with the muscle forces added, and its loads.
+        """Return a geometry with muscle forces and released patella added, and its loads.
 
         Args:
             geometry: result of `geometry`, with contact points.
         """
         if geometry.problems:
             return geometry, unsolved(geometry.problems)
+        if self.patella is None or geometry.extensor is None:
+            return self._solved(geometry)
+        return self.patella.solved(geometry, self._solved, self.patella_start)
+
+    def solved_with_muscles(self, geometry: KneeGeometry) -> tuple[KneeGeometry, SolvedLoads]:
+        """Return a geometry with its released patella, and its loads; muscle forces are kept.
+
+        Args:
+            geometry: result of `geometry`, with contact points and muscle forces.
+        """
+
+        def solve(one: KneeGeometry) -> tuple[KneeGeometry, SolvedLoads]:
+            return one, solve_knee(one, self.friction)
+
+        if self.patella is None or geometry.extensor is None:
+            return solve(geometry)
+        return self.patella.solved(geometry, solve, self.patella_start)
+
+    def _solved(self, geometry: KneeGeometry) -> tuple[KneeGeometry, SolvedLoads]:
         if self.muscles is None:
             return geometry, solve_knee(geometry, self.friction)
         return self.muscles.solve(geometry, self.friction)

@@ -129,6 +129,11 @@ class Knee(AssembledKnee):
         cache: whether a lattice stores its prepared operators on disk for later runs.
         patellofemoral_contact: contact model of button and femoral component, or its name; None:
             the button is rigid. It needs `extensor` and a closed button with a flat back.
+        released_patella: released coordinates of the patella, as `patella_equilibrium`: "ap",
+            "si", "flexion" and perhaps "shift", "tilt", "rotation". Its forces then act in all
+            results. Empty: the patella moves in its plane.
+        head_shares: head of the quadriceps -> its share of the tension where that is unknown, or
+            given as one number; None: the quadriceps of `extensor` is the only head.
 
     Raises:
         InputError: the arguments do not fit together.
@@ -163,13 +168,16 @@ class Knee(AssembledKnee):
             q: configuration, shape (nq,); or (n, nq) for n configurations.
             v: velocity, shape (nv,); or (n, nv).
             tensions: muscle -> tension, N; or the tension of the quadriceps alone, N. Muscles
-                without a tension are slack. If "patellar_ligament" is given with the quadriceps, as
-                in `KneeLoads.tensions`, the patellofemoral force balances these two tensions.
+                without a tension are slack. With a released patella its heads are such muscles, and
+                a number is the tension of all heads. If "patellar_ligament" is given with the
+                quadriceps, as in `KneeLoads.tensions` of a plane patella, the patellofemoral force
+                balances these two tensions.
             data: data from `create_data`, to save time.
 
         Returns:
             `pin.StdVec_Force`, one per joint in its joint's frame: `fext` of `pin.rnea` and
-            `pin.aba`. For n configurations an array (n, njoints, 6).
+            `pin.aba`. For n configurations an array (n, njoints, 6). A released patella passes all
+            its forces on to femur and tibia, so that none acts on its joint.
 
         Raises:
             InputError: q or v has the wrong size, or a muscle is unknown.
@@ -190,10 +198,21 @@ class Knee(AssembledKnee):
         if self._crossing is not None:
             on_insert = on_insert + self._crossing.wrench(kinematics.pose)
         muscle_tensions = self._tensions(tensions)
+        heads = {} if self.patella is None else self._take_heads(muscle_tensions)
         links = summed(self._loads_beside_contact(data, kinematics, muscle_tensions))
+        if heads:
+            from tkamb.knee.patella_equilibrium import pulled_tibia
+
+            on_insert = on_insert + pulled_tibia(self, kinematics, heads, data)[0]
         for link, sign in (("tibia", 1.0), ("femur", -1.0)):
             links[link] = links.get(link, np.zeros(6)) + sign * on_insert
         return self._with_lines(data, muscle_tensions, self.bridge.joint_forces(data.data, links))
+
+    def _take_heads(self, tensions: dict[str, float]) -> dict[str, float]:
+        """Take the heads of a released patella that pull out of the tensions."""
+        assert self.patella is not None
+        heads = {head.name: tensions.pop(head.name, 0.0) for head in self.patella.heads}
+        return heads if any(heads.values()) else {}
 
     def _loads_beside_contact(
         self, data: KneeData, kinematics: KneePose, muscle_tensions: Mapping[str, float]
@@ -688,7 +707,7 @@ class Knee(AssembledKnee):
         Raises:
             InputError: a coordinate is unknown, the knee has no contact model, the joints between
                 tibia and femur have too few degrees of freedom for the pose, or derivatives are
-                asked of a contact model without an exact tangent.
+                asked of a contact model without an exact tangent or with a released patella.
             ComputationError: the femur does not lie over the insert.
         """
         from tkamb.knee.pressed import contact_of_user
@@ -702,6 +721,9 @@ class Knee(AssembledKnee):
         for name in released:
             if name not in allowed:
                 raise InputError(f"no coordinate '{name}'", "released", names_near(name, allowed))
+        if derivatives and self.patella is not None:
+            hint = "take differences, or a knee with a plane patella"
+            raise InputError("not with a released patella", "derivatives", hint)
         data = self._data(data)
         instant = self._instant(q, v, a, fext, tensions, data)
         probe = data.probe if data.probe is not None else contact.probe()
@@ -821,12 +843,13 @@ class Knee(AssembledKnee):
             bridge.shank_needs(pin_data),
             bridge.external_on(self.anatomy.femur, pin_data, fext),
             bridge.external_on(self.anatomy.patella, pin_data, fext),
-            self.ligaments,
+            self._instant_ligaments,
             patella,
             self.friction,
             self.contact is not None and self.contact.pair.split is not None,
             None if fext is None else bridge.on_shank(pin_data, fext),
             muscles,
+            self.patella,
         )
 
     def _check_fext(self, fext: Any) -> None:

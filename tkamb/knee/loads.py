@@ -105,11 +105,14 @@ class KneeLoads:
     def tensions(self) -> dict[str, float]:
         """Muscle or "patellar_ligament" -> tension, N, as input of `Knee.external_forces`.
 
-        The result is empty without an extensor mechanism.
+        A released patella has the tensions of its heads. The result is empty without an extensor
+        mechanism.
         """
         extensor, values = self.geometry.extensor, self.equations.values
         if extensor is None:
             return {}
+        if extensor.released is not None and not self.slack:
+            return dict(extensor.released.tensions)
         values_by_name = {name: values.get(muscle_load(name), NAN) for name in extensor.muscles}
         return values_by_name | {"patellar_ligament": values.get("patellar_ligament", NAN)}
 
@@ -154,7 +157,7 @@ def knee_loads(
         value_of("patellar_ligament", NAN),
         value_of("patellofemoral", NAN),
         value_of("patellofemoral_tangential", NAN),
-        dict(geometry.tensions),
+        geometry.tensions | _of_patella(geometry, solved),
         {
             name.removeprefix("residual_"): value
             for name, value in values.items()
@@ -175,6 +178,14 @@ def knee_loads(
         solved,
         geometry,
     )
+
+
+def _of_patella(geometry: KneeGeometry, solved: SolvedLoads) -> dict[str, float]:
+    """Return the tensions, N, of the ligaments of a released patella."""
+    released = None if geometry.extensor is None else geometry.extensor.released
+    if released is None or released.found is None or solved.problems:
+        return {}
+    return dict.fromkeys(released.found.tensions, 0.0) if solved.slack else released.found.tensions
 
 
 def _mirrored(name: str) -> bool:

@@ -38,9 +38,17 @@ from tkamb.geometry.frames import (
     cross_matrix,
     inverse,
     pose,
+    rotate,
     transform,
 )
-from tkamb.knee.balance import Balance, BalanceStatus, Trial, find_balance
+from tkamb.knee.balance import (
+    SMALL_RESIDUAL,
+    BalanceStatus,
+    Trial,
+    find_balance,
+    polished,
+    smallest_eigenvalues,
+)
 from tkamb.knee.button import Button
 from tkamb.knee.ligaments import DISTAL, PROXIMAL, BundleArrays, Ligament
 from tkamb.knee.wrapping import TautPath, path_in_link
@@ -52,15 +60,9 @@ PLANE = (0, 1, 3)
 # m: arm that makes rotations comparable to translations. Chosen: about half the width of a button.
 ARM = 0.015
 SCALE = np.array([1.0, 1.0, 1.0, ARM, ARM, ARM])
-# 1: residual over the quadriceps' tension at which Newton's method stops.
-SMALL_RESIDUAL = 1e-10
 # 1: residual over the quadriceps' tension above which an equilibrium is flagged. A larger one
 # remains where the contact's force jumps as a column crosses an edge of two femoral facets.
 LARGEST_RESIDUAL = 1e-6
-# 1: steps of Newton's method after the search. Not studied.
-MAX_STEPS = 12
-# 1: halvings of such a step until the residual falls. Not studied.
-MAX_HALVINGS = 6
 # m: distance from the patella's sagittal plane within which a head pulls on both sides.
 CENTRAL = 1.0 * MILLIMETRE
 
@@ -198,6 +200,32 @@ class PatellaBody:
         """Return pose_patella_in_insert (4, 4) at coordinates (6,)."""
         return np.asarray(self.poses["femur"] @ self.joint @ patella_pose(coordinates))
 
+    def pull(self, coordinates: Array) -> Array:
+        """Return the wrench (6,) of heads and lines on the patella, button frame, N and N·m.
+
+        Raises:
+            ComputationError: a line has no path.
+        """
+        place = self.femur_in_button(coordinates)
+        heads = (head.loads(place, insertion)[0] for head, insertion in self._heads)
+        return sum(heads, self.bundles.wrench(place))
+
+    def head_forces(self, coordinates: Array) -> tuple[Array, Array]:
+        """Return insertions (h, 3), m, and forces (h, 3), N, of the heads on the patella.
+
+        Both are in the insert frame.
+
+        Raises:
+            ComputationError: an end of a head lies inside the outline.
+        """
+        patella, femur = self.patella(coordinates), self.poses["femur"]
+        back = inverse(femur) @ patella
+        places = np.array([transform(back, head.insertion) for head in self.heads])
+        pulls = [
+            -head.tension * head.slopes(at)[0] for head, at in zip(self.heads, places, strict=True)
+        ]
+        return transform(femur, places), rotate(femur, np.array(pulls))
+
     def wrench(self, coordinates: Array) -> Array:
         """Return w (6,), N and N·m; NaN where the contact model or a line has no result."""
         return self._loads(coordinates)[0]
@@ -220,13 +248,16 @@ class PatellaBody:
         slopes = [load.stiffness for load in contact.loads] + [slope for _, slope in heads]
         return wrench, sum(slopes, tangent), bool(contact.exact)
 
-    def balance(self, start: Array, released: Sequence[int], size: float) -> PatellaBalance:
+    def balance(
+        self, start: Array, released: Sequence[int], size: float, near: bool = False
+    ) -> PatellaBalance:
         """Return the equilibrium of the released coordinates.
 
         Args:
             start: initial guess, shape (6,); coordinates that are not released keep their values.
             released: numbers of the n released coordinates.
             size: tension of the quadriceps, N, to which the residual is compared.
+            near: whether Newton's method is tried before the search.
         """
         rows, trials = list(released), dict[bytes, Trial]()
 
@@ -252,13 +283,22 @@ class PatellaBody:
                 trials[x.tobytes()] = trial(x)
             return trials[x.tobytes()]
 
-        found = find_balance(once, np.asarray(start, float)[rows] * SCALE[rows])
-        x, last = _polished(once, found, size)
-        residual = float(np.abs(last.force).max())
-        failed = found.status is not BalanceStatus.OK
-        problem = f"patella: {found.status.value}" if failed else ""
-        stiffness = found.stiffness if last.stiffness is None else last.stiffness
-        return PatellaBalance(coordinates_at(x), residual, stiffness, problem, len(trials))
+        def result(x: Array, last: Trial, stiffness: Array, problem: str = "") -> PatellaBalance:
+            residual = float(np.abs(last.force).max())
+            return PatellaBalance(coordinates_at(x), residual, stiffness, problem, len(trials))
+
+        x = np.asarray(start, float)[rows] * SCALE[rows]
+        if near:
+            closer, last = polished(once, x, size)
+            small = np.abs(last.force).max() <= SMALL_RESIDUAL * size
+            if small and last.stiffness is not None and smallest_eigenvalues(last.stiffness)[1] > 0:
+                return result(closer, last, last.stiffness)
+        found = find_balance(once, x)
+        x, last = found.coordinates, once(found.coordinates)
+        if found.status is not BalanceStatus.OK:
+            return result(x, last, found.stiffness, f"patella: {found.status.value}")
+        x, last = polished(once, x, size)
+        return result(x, last, found.stiffness if last.stiffness is None else last.stiffness)
 
     def twists(self, coordinates: Array) -> Array:
         """Return T (6, 6): displacement of the patella by its coordinates, button frame.
@@ -296,25 +336,6 @@ class PatellaBody:
                 + axes @ cross(axis, moment)
             )
         return result
-
-
-def _polished(trial: Any, found: Balance, size: float) -> tuple[Array, Trial]:
-    """Return the coordinates of the smallest residual that Newton's method finds, and its trial."""
-    x, last = found.coordinates, trial(found.coordinates)
-    for _ in range(MAX_STEPS):
-        small = np.abs(last.force).max() <= SMALL_RESIDUAL * size
-        if small or last.stiffness is None or found.status is not BalanceStatus.OK:
-            break
-        step = np.linalg.solve(last.stiffness, last.force)
-        for _ in range(MAX_HALVINGS):
-            closer = trial(x + step)
-            if np.linalg.norm(closer.force) < np.linalg.norm(last.force):
-                break
-            step = 0.5 * step
-        else:
-            break
-        x, last = x + step, closer
-    return x, last
 
 
 def patella_pose(coordinates: Array) -> Array:

@@ -1,44 +1,40 @@
-"""The equilibrium of a knee's patella in six degrees of freedom (`Knee.patella_equilibrium`)."""
+"""The released patella of a knee on a user's model: its heads, forces and derivatives."""
 
-import time as clock
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
 
-from tkamb.contact.result import ContactStatus
-from tkamb.errors import ComputationError, InputError
-from tkamb.geometry.frames import PATELLA_BODY_COORDINATES, Array, inverse, mirrored_pose
-from tkamb.knee.button import ButtonPress
-from tkamb.knee.canonical import se3
-from tkamb.knee.ligaments import ligament_loads
-from tkamb.knee.load import LinkPoint, PointForces, link_point, wrenches
-from tkamb.knee.muscles import off_femur
-from tkamb.knee.patella_body import (
-    LARGEST_RESIDUAL,
-    PLANE,
-    Head,
-    PatellaBalance,
-    PatellaBody,
-    coordinates_of,
-    patella_pose,
-    released_numbers,
-    sides_without_head,
+from tkamb.errors import ComputationError, InputError, real_number
+from tkamb.geometry.frames import (
+    PATELLA_BODY_COORDINATES,
+    Array,
+    cross_matrix,
+    mirrored_pose,
+    transform,
 )
+from tkamb.knee.canonical import KneePose, force_cross, se3
+from tkamb.knee.found_patella import (
+    LIGHT_PRESS,
+    FoundPatella,
+    first_balance,
+    found_patella,
+    pressed_coordinates,
+)
+from tkamb.knee.ligaments import DISTAL, PROXIMAL, BundleArrays
+from tkamb.knee.load import LinkPoint, link_point, wrench_of, wrenches
+from tkamb.knee.muscles import off_femur
+from tkamb.knee.patella_body import SCALE, PatellaBody, patella_pose, released_numbers
+from tkamb.knee.patella_frame import HeadShare, PatellaMethod, tibial_wrench
 from tkamb.knee.pressed import KneePatellaResult, patella_of_user
 
 if TYPE_CHECKING:
-    from tkamb.knee.assembled import KneeData
+    from tkamb.knee.assembled import AssembledKnee, KneeData
     from tkamb.knee.knee import Knee
 
 WHERE = "patella_equilibrium"
-
-
-# 1: patellofemoral force over quadriceps' tension with which the first guess is pressed where the
-# plane patella gives none. Chosen: that of a slightly bent knee.
-LIGHT_PRESS = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,74 +74,6 @@ class PatellaEquilibrium:
         return bool(self.reason)
 
 
-@dataclass(frozen=True, eq=False)
-class FoundPatella:
-    """The patella of a right knee in equilibrium, in the insert frame.
-
-    Args:
-        balance: coordinates, residual and stiffness.
-        press: contact of the button; None: no equilibrium.
-        tensions: ligament at the patella -> tension, N.
-        loads: loads of these ligaments on the links.
-        flags: warnings in words, without those of the contact.
-        problem: why there is no equilibrium, in words; empty: there is one.
-    """
-
-    balance: PatellaBalance
-    press: ButtonPress | None = None
-    tensions: dict[str, float] = field(default_factory=dict)
-    loads: tuple[PointForces, ...] = ()
-    flags: tuple[str, ...] = ()
-    problem: str = ""
-
-
-def found_patella(
-    body: PatellaBody, guesses: Iterable[Callable[[], Array]], numbers: Sequence[int]
-) -> FoundPatella:
-    """Return the patella in equilibrium from the first guess that leads to one.
-
-    Args:
-        body: forces on the patella, with at least one head that pulls.
-        guesses: functions that return initial guesses (6,).
-        numbers: numbers of the released coordinates.
-    """
-    tensions = {head.name: head.tension for head in body.heads}
-    size, balance = sum(tensions.values()), None
-    for guess in guesses:
-        balance = body.balance(guess(), numbers, size)
-        if not balance.problem:
-            break
-    assert balance is not None
-    insertions = {head.name: head.insertion for head in body.heads}
-    flags = [
-        f"patella: no head of the quadriceps pulls on the {side} side"
-        for side in sides_without_head(insertions, tensions)
-    ]
-    if balance.problem:
-        return FoundPatella(balance, flags=tuple(flags), problem=balance.problem)
-    if balance.residual > LARGEST_RESIDUAL * size:
-        flags.append(
-            f"patella: a residual of {balance.residual:.2g} N remains: the contact's force jumps "
-            "there from facet to facet, or its model's solver is no more exact"
-        )
-    began, button = clock.perf_counter(), body.button
-    contact = button.contact.model.evaluate(
-        button.contact.state, body.femur_in_button(balance.coordinates)
-    )
-    problem = "" if contact.status is ContactStatus.OK else contact.reason
-    if not problem and not (contact.pressure > 0.0).any():
-        problem = "its lines hold it off the femur: the button is not in contact"
-    if problem:
-        return FoundPatella(balance, flags=tuple(flags), problem=f"patella: {problem}")
-    poses = body.poses | {"patella": body.patella(balance.coordinates)}
-    press = ButtonPress(np.full(3, np.nan), poses["patella"] @ button.in_patella, contact)
-    press = replace(press, flags=button.flags(press), seconds=clock.perf_counter() - began)
-    pulls, loads = ligament_loads(body.lines, poses)
-    names = [line.name for line in body.lines]
-    pulled = dict(zip(names, pulls.tolist(), strict=True))
-    return FoundPatella(balance, press, pulled, loads, tuple(flags))
-
-
 def find_equilibrium(
     knee: "Knee",
     q: Array,
@@ -159,36 +87,17 @@ def find_equilibrium(
         InputError: see there.
         ComputationError: see there.
     """
-    button, numbers = knee.button_contact, released_numbers(released)
-    if button is None:
-        raise InputError("has no patellofemoral contact model", "Knee", "give it")
-    heads = _heads(knee, tensions)
-    _check_strands(knee)
+    numbers = released_numbers(released)
     kinematics = knee._kinematics(data, q)
-    poses = knee._link_poses(kinematics, None)
-    # Each search has its own probe: the warm start of the contact is not part of the result.
-    probe, joint = button.contact.probe(), knee.chain.patella_joint_in_femur
-    body = PatellaBody(button, probe, joint, heads, knee._others, poses)
-    guesses: list[Callable[[], Array]] = []
-    last = data.patella_coordinates
-    if last is not None and len(numbers) == len(PATELLA_BODY_COORDINATES):
-        guesses.append(lambda: last)
-
-    def pressed_plane() -> Array:
-        plane = knee._find_patella(kinematics, data)
-        ratio = max(plane.patellofemoral_ratio, LIGHT_PRESS)
-        force = sum(tensions.values()) * ratio * plane.contact_normal
-        return pressed_coordinates(body, plane.coordinates, force)
-
-    found = found_patella(body, [*guesses, pressed_plane], numbers)
-    balance = found.balance
-    place = joint @ patella_pose(balance.coordinates)
+    body, guesses = _search(knee, kinematics, tensions, len(numbers) == 6, data)
+    found = found_patella(body, guesses, numbers)
+    balance, button = found.balance, body.button
+    place = body.joint @ patella_pose(balance.coordinates)
     contact, forces = None, pin.StdVec_Force()
     if found.press is not None:
         data.patella_coordinates = balance.coordinates
-        poses |= {"patella": body.patella(balance.coordinates)}
-        contact = patella_of_user(found.press, poses, button.in_patella, knee.left)
-        links = _link_wrenches(found, heads, poses)
+        contact = patella_of_user(found.press, found.poses, button.in_patella, knee.left)
+        links = _link_wrenches(found, body)
         forces = knee.bridge.joint_forces(data.data, links)
     return PatellaEquilibrium(
         dict(zip(PATELLA_BODY_COORDINATES, balance.coordinates.tolist(), strict=True)),
@@ -204,68 +113,61 @@ def find_equilibrium(
     )
 
 
-def pressed_coordinates(body: PatellaBody, plane: Array, force: Array) -> Array:
-    """Return the coordinates (6,) of the plane patella, pressed on the femur: an initial guess.
+def _search(
+    knee: "Knee",
+    kinematics: "KneePose",
+    tensions: Mapping[str, float],
+    warm: bool,
+    data: "KneeData",
+) -> tuple[PatellaBody, list[Callable[[], Array]]]:
+    """Return the forces on the patella at the pose of q, and functions that return initial guesses.
 
     Args:
-        body: forces on the patella.
-        plane: coordinates of the plane patella, shape (3,), m and rad.
-        force: patellofemoral force on the patella, insert frame, shape (3,), N.
+        tensions: head -> tension, N.
+        warm: whether the last equilibrium is the first guess.
 
     Raises:
-        ComputationError: the button cannot be pressed there.
+        InputError: the knee has no patellofemoral contact model or no strand, another muscle has a
+            tension, or no head pulls.
     """
-    coordinates = np.zeros(6)
-    coordinates[list(PLANE)] = plane
-    press = body.button.pressed(body.poses["femur"], body.patella(coordinates), force)
-    if press.problem:
-        raise ComputationError(press.problem, WHERE)
-    pressed = coordinates_of(
-        inverse(body.poses["femur"] @ body.joint) @ press.pose @ inverse(body.button.in_patella)
-    )
-    coordinates[list(PLANE)] = pressed[list(PLANE)]
-    return coordinates
+    button, poses = knee.button_contact, knee._link_poses(kinematics, None)
+    if button is None:
+        raise InputError("has no patellofemoral contact model", "Knee", "give it")
+    method = knee.patella
+    if method is None:
+        method = patella_method(knee, None, PATELLA_BODY_COORDINATES)
+    _check_pull(method, tensions)
+    # Each search has its own probe: the warm start of the contact is not part of the result.
+    body = method.body_of_heads(poses, tensions)
+    guesses: list[Callable[[], Array]] = []
+    last = data.patella_coordinates
+    if last is not None and warm:
+        guesses.append(lambda: last)
+
+    def pressed_plane() -> Array:
+        plane = knee._find_patella(kinematics, data)
+        ratio = max(plane.patellofemoral_ratio, LIGHT_PRESS)
+        force = sum(tensions.values()) * ratio * plane.contact_normal
+        return pressed_coordinates(body, plane.coordinates, force)
+
+    return body, [*guesses, pressed_plane]
 
 
-def _heads(knee: "Knee", tensions: Mapping[str, float]) -> list[Head]:
-    """Return the heads of the quadriceps on the chain, with their tensions.
-
-    Raises:
-        InputError: a muscle with a tension does not run from the femur to the patella, or no head
-            pulls.
-    """
-    assert knee.extensor_lines is not None and knee.extensor is not None
-    main, chain, heads = knee.extensor_lines.muscle, knee.chain, []
-    outline = None if main.wrap is None else main.wrap.outline
-    points = {main.name: main.points}
-    for muscle in knee.muscles:
-        if tensions.get(muscle.name, 0.0) > 0.0 or link_point(muscle.points[-1]).link == "patella":
-            points[muscle.name] = tuple(
-                knee.bridge.link_point(link_point(p)) for p in muscle.points
-            )
-    for name, path in points.items():
-        tension = tensions.get(name, 0.0)
-        if name == main.name and tension == 0.0:
-            continue
-        segment = off_femur(path, chain)
-        origin, insertion = path[segment : segment + 2]
-        if insertion.link != "patella" or segment + 2 != len(path):
+def _check_pull(method: PatellaMethod, tensions: Mapping[str, float]) -> None:
+    """Raise an InputError unless heads pull, no other muscle does, and there is a strand."""
+    names = {head.name for head in method.heads}
+    for name, tension in tensions.items():
+        if tension > 0.0 and name not in names:
             where = f"muscle {name}"
             raise InputError("does not run from the femur to the patella", where, "set it to 0")
-        heads.append(Head(name, _on(chain, origin, "femur"), insertion.position, outline, tension))
-    if not any(head.tension > 0.0 for head in heads):
+    if not any(tension > 0.0 for tension in tensions.values()):
         raise InputError("no head of the quadriceps pulls", WHERE, "give tensions above 0")
-    return heads
+    _check_strands(method)
 
 
-def _on(chain: Any, point: LinkPoint, link: str) -> Array:
-    place = chain.link_in(point.link, link)
-    return np.asarray(place[:3, :3] @ point.position + place[:3, 3])
-
-
-def _check_strands(knee: "Knee") -> None:
+def _check_strands(method: PatellaMethod) -> None:
     """Raise an InputError unless a ligament joins patella and tibia."""
-    if not any({"patella", "tibia"} <= set(line.links) for line in knee._others):
+    if not any({"patella", "tibia"} <= set(line.links) for line in method.lines):
         raise InputError(
             "has no strand of the patellar ligament",
             WHERE,
@@ -273,20 +175,168 @@ def _check_strands(knee: "Knee") -> None:
         )
 
 
-def _link_wrenches(
-    found: FoundPatella, heads: Sequence[Head], poses: Mapping[str, Array]
-) -> dict[str, Array]:
+def patella_method(
+    knee: "AssembledKnee", shares: Mapping[str, float] | None, released: Sequence[str]
+) -> PatellaMethod:
+    """Return how the patella of a knee is found, with its ligaments that end on the patella.
+
+    Args:
+        knee: a knee with a patellofemoral contact model.
+        shares: head -> share of the quadriceps' tension; None: not known, tensions are given.
+        released: names of the released coordinates.
+
+    Raises:
+        InputError: a share is not that of a head, or the shares do not sum to 1.
+    """
+    lines, button = knee.extensor_lines, knee.button_contact
+    assert lines is not None and button is not None
+    main, ends = lines.muscle, _head_ends(knee)
+    outline = None if main.wrap is None else main.wrap.outline
+    for name, share in (shares or {}).items():
+        if name not in ends:
+            hint = f"heads of the quadriceps: {', '.join(ends)}"
+            raise InputError(f"no head '{name}'", "head_shares", hint)
+        if not 0.0 < real_number(share, f"head_shares: {name}", "give 0 to 1") <= 1.0:
+            raise InputError(f"share {share} of '{name}'", "head_shares", "give 0 to 1")
+    if shares is not None and abs(sum(shares.values()) - 1.0) > 1e-6:
+        raise InputError("the shares do not sum to 1", "head_shares")
+    heads = tuple(
+        HeadShare(name, *ends[name], share)
+        for name, share in (shares or dict.fromkeys(ends, 0.0)).items()
+    )
+    return PatellaMethod(button, knee.chain, heads, knee._others, outline, tuple(released))
+
+
+def released_method(
+    knee: "AssembledKnee", released: Sequence[str], shares: Mapping[str, float] | None
+) -> PatellaMethod:
+    """Return how the patella of a knee with `released_patella` is found.
+
+    Args:
+        knee: the knee.
+        released: names of the released coordinates.
+        shares: head -> share of the quadriceps' tension; None: the quadriceps is the only head.
+
+    Raises:
+        InputError: the knee has no patellofemoral contact model or no strand; a name is unknown;
+            ap, si or flexion is missing; or the shares do not fit.
+    """
+    released_numbers(released)
+    if not {"ap", "si", "flexion"} <= set(released):
+        words = "needs ap, si and flexion: the quadriceps moves them"
+        raise InputError(words, "released_patella")
+    if knee.button_contact is None or knee.extensor is None:
+        raise InputError("needs patellofemoral_contact=", "released_patella", "give it to the knee")
+    method = patella_method(knee, shares or {knee.extensor.quadriceps.name: 1.0}, released)
+    _check_strands(method)
+    return method
+
+
+def _is_on_patella(knee: "AssembledKnee", frame: str) -> bool:
+    """Return whether a frame of the user's model is fixed to the patella."""
+    patella = knee.anatomy.patella
+    if patella is None:
+        return frame == "patella"
+    return bool(knee.anatomy.frame(frame).joint == patella.joint)
+
+
+def _head_ends(knee: "AssembledKnee") -> dict[str, tuple[LinkPoint, LinkPoint]]:
+    """Return head -> last point on the femur, and insertion on the patella, links of the chain."""
+    assert knee.extensor_lines is not None
+    main, ends = knee.extensor_lines.muscle, {}
+    points = {main.name: main.points}
+    for muscle in knee.muscles:
+        if _is_on_patella(knee, link_point(muscle.points[-1]).link):
+            points[muscle.name] = tuple(
+                knee.bridge.link_point(link_point(p)) for p in muscle.points
+            )
+    for name, path in points.items():
+        segment = off_femur(path, knee.chain)
+        origin, insertion = path[segment : segment + 2]
+        if insertion.link == "patella" and segment + 2 == len(path):
+            place = transform(knee.chain.link_in(origin.link, "femur"), origin.position)
+            ends[name] = LinkPoint("femur", place), insertion
+    return ends
+
+
+def _link_wrenches(found: FoundPatella, body: PatellaBody) -> dict[str, Array]:
     """Return link -> wrench (6,) about the insert's origin of all loads at the patella."""
     assert found.press is not None
-    on_patella, loads = found.press.on_patella.copy(), found.loads
-    back, femur = inverse(poses["femur"]), poses["femur"]
-    for head in heads:
-        on_femur = back @ poses["patella"]
-        insertion = on_femur[:3, :3] @ head.insertion + on_femur[:3, 3]
-        force = -head.tension * (femur[:3, :3] @ head.slopes(insertion)[0])
-        place = femur[:3, :3] @ insertion + femur[:3, 3]
-        on_patella += np.concatenate([force, np.cross(place, force)])
+    loads = found.loads
+    heads = wrench_of(*body.head_forces(found.balance.coordinates)).sum(axis=0)
+    on_patella = found.press.on_patella + heads
     links = {"patella": on_patella, "femur": -on_patella}
     for load, wrench in zip(loads, wrenches(loads), strict=True):
         links[load.link] = links.get(load.link, np.zeros(6)) + wrench
     return links
+
+
+def pulled_tibia(
+    knee: "Knee", kinematics: KneePose, tensions: Mapping[str, float], data: "KneeData"
+) -> tuple[Array, PatellaBody, Array, Array]:
+    """Return the wrench (6,) of a released patella on the tibia, about the insert's origin.
+
+    The wrench on the femur is opposite.
+
+    Args:
+        knee: a knee with a released patella.
+        kinematics: pose of the knee.
+        tensions: head -> tension, N.
+        data: data of the knee.
+
+    Returns:
+        Wrench; forces on the patella; its coordinates (6,); stiffness (n, n) of its equilibrium.
+
+    Raises:
+        ComputationError: there is no equilibrium.
+    """
+    method = knee.patella
+    assert method is not None
+    body, guesses = _search(knee, kinematics, tensions, True, data)
+    balance = first_balance(body, guesses, released_numbers(method.released))
+    if balance.problem:
+        raise ComputationError(balance.problem.removeprefix("patella: "), "patella")
+    data.patella_coordinates = balance.coordinates
+    wrench = tibial_wrench(body, balance.coordinates)
+    return wrench, body, balance.coordinates, balance.stiffness
+
+
+def pulled_tibia_slope(
+    body: PatellaBody, coordinates: Array, stiffness: Array, released: Sequence[str]
+) -> Array:
+    """Return the derivative (6, 6) of `pulled_tibia` by a displacement of the femur.
+
+    The displacement xi of the femur against the insert carries the patella along, and the patella
+    moves by dc to its new equilibrium. With its generalised forces g, its stiffness K, and the
+    stiffness K_t of the ligaments to the tibia, all about the insert's origin,
+
+        dw = K_t (xi + A dc),    K dc = dg = A^T (xi x* w - K_t xi),
+
+    where A dc is the displacement of the patella, and xi x* w turns the wrench w with the femur.
+
+    Args:
+        body: forces on the patella.
+        coordinates: its coordinates in equilibrium, shape (6,).
+        stiffness: stiffness of the equilibrium, shape (n, n).
+        released: names of the n released coordinates.
+
+    Raises:
+        InputError: a ligament from patella to tibia wraps the femur.
+    """
+    if any({"femur", "tibia"} <= set(line.links) for line in body.lines):
+        where = "external_forces_derivatives"
+        raise InputError("a ligament from patella to tibia wraps the femur", where)
+    rows = list(released_numbers(released))
+    patella = body.patella(coordinates)
+    button = patella @ body.button.in_patella
+    placed = {"patella": (PROXIMAL, np.eye(4)), "tibia": (DISTAL, body.poses["tibia"])}
+    shank = [line.on_links(placed) for line in body.lines if "tibia" in line.links]
+    lines = BundleArrays.between(shank)
+    tangent, wrench = lines.tangent(patella), lines.wrench(patella)
+    turn = button[:3, :3]
+    to_insert = np.block([[turn, cross_matrix(button[:3, 3]) @ turn], [np.zeros((3, 3)), turn]])
+    moves = to_insert @ body.twists(coordinates)[:, rows]
+    forces = moves.T @ (force_cross(np.eye(6), wrench) - tangent)
+    scale = SCALE[rows]
+    change = np.linalg.solve(stiffness * np.outer(scale, scale), forces)
+    return np.asarray(tangent @ (np.eye(6) + moves @ change))

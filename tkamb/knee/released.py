@@ -163,6 +163,15 @@ class ReleasedKneeSettings:
     contact_force_share: float = 2e-4
     """1: see `contact_force_tolerance`. The facets of the patella change the force
     by about this share."""
+    tension_tolerance: float = 1e-7
+    """1: change of the quadriceps' tension between passes, relative to it, below which passes with
+    a released patella have converged."""
+    joint_residual: float = 1e-6
+    """1: residual force on a released coordinate over the quadriceps' tension below which knee and
+    released patella are in equilibrium together, if the quadriceps is the only muscle."""
+    joint_passes: int = 4
+    """1: passes that are added to reach `joint_residual`. A facet of the patella may prevent it:
+    then the other tolerances decide."""
     max_passes: int = 24
     """Maximum number of passes. A pass halves the change of a compliant knee."""
     inner_tolerance_share: float = 0.1
@@ -203,6 +212,7 @@ class KneeEquilibrium:
         compliance_error: `Relaxation.compliance_error` at the end.
         residual: largest residual force on a released coordinate with patella, lines and contact of
             the returned pose, N (moments divided by the lever arm); inf: not measured.
+        pull: tension of the patellar ligament that balances flexion in the last pass, N.
         second: description of a second equilibrium from another initial guess (`InitialPoses`);
             empty: not found.
     """
@@ -218,6 +228,7 @@ class KneeEquilibrium:
     problem: str
     compliance_error: float = 0.0
     residual: float = np.inf
+    pull: float = np.nan
     second: str = ""
 
 
@@ -281,17 +292,28 @@ class ReleasedKnee:
             ComputationError: no muscle forces balance the frame.
         """
         coordinates, middle, force = np.array(start, float), np.array(start[:3]), np.full(3, np.nan)
+        added = 0
         # Every frame begins with a taut patellar ligament, even if it was slack in the last frame.
         knee, slack, trials, passes = before, False, 0, 0
         last_contact, relaxation, distances = None, Relaxation(), [np.inf, np.inf]
+        pull = None if before is None else _pull(before.geometry)
         if instant.muscles and before:
             coordinates, last_contact = self._at_load(coordinates, before.contact)
         # The muscle forces of the last frame are a good guess only near the pose of their contact.
         stop_distance = RELEASED_KNEE.muscle_force_range if last_contact else np.inf
         while passes < RELEASED_KNEE.max_passes:
             knee, pushes = self._pass(
-                instant, coordinates, middle, slack, knee, last_contact, relaxation, stop_distance
+                instant,
+                coordinates,
+                middle,
+                slack,
+                knee,
+                last_contact,
+                relaxation,
+                stop_distance,
+                pull,
             )
+            pull, change_of_pull = self._next_pull(instant, knee, slack)
             last_contact = knee.contact
             passes, trials = passes + 1, trials + knee.balance.trials
             change = float(np.linalg.norm(knee.contact.wrench[:3] - force))
@@ -307,6 +329,7 @@ class ReleasedKnee:
             if pushes:
                 # The patellar ligament cannot push: the search begins again with a slack ligament.
                 slack, knee, last_contact = True, before, None
+                pull = None
                 coordinates, middle, force = (
                     np.array(start, float),
                     np.array(start[:3]),
@@ -316,6 +339,7 @@ class ReleasedKnee:
             elif knee.problem or (
                 relaxation.converged
                 and knee.balance.converged
+                and change_of_pull < RELEASED_KNEE.tension_tolerance
                 and remaining_distance(distances[-3:]) * distances[-1]
                 < RELEASED_KNEE.knee_tolerance
                 and remaining_distance(distances[-3:]) * change
@@ -329,9 +353,17 @@ class ReleasedKnee:
                     replace(knee, compliance_error=relaxation.compliance_error),
                     middle,
                     slack,
+                    pull,
                 )
-                if knee.problem or knee.residual <= self._residual_limit(knee.contact):
+                joint = np.inf
+                if pull is not None and instant.muscles is None:
+                    joint = RELEASED_KNEE.joint_residual * pull[0]
+                together = knee.residual <= joint or added == RELEASED_KNEE.joint_passes
+                if knee.problem or (
+                    together and knee.residual <= self._residual_limit(knee.contact)
+                ):
                     return knee
+                added += not together
         assert knee is not None
         return replace(knee, problem="the iteration between knee and patella does not converge")
 
@@ -371,7 +403,12 @@ class ReleasedKnee:
         return max(RELEASED_KNEE.residual_tolerance, share * force)
 
     def _measured(
-        self, instant: Instant, knee: KneeEquilibrium, middle: Array, slack: bool
+        self,
+        instant: Instant,
+        knee: KneeEquilibrium,
+        middle: Array,
+        slack: bool,
+        pull: "tuple[float, Array | None] | None",
     ) -> KneeEquilibrium:
         if knee.problem:
             return knee
@@ -379,6 +416,8 @@ class ReleasedKnee:
         if instant.extensor is not None:
             patella = instant.extensor.patella(knee_pose(knee.coordinates), knee.patella)
         geometry = instant.geometry(knee.coordinates, patella)
+        if not slack:
+            geometry = _pulled(instant, geometry, patella, pull, complete=True)
         joint = self._joint(instant, geometry, middle, slack)
         if knee.geometry.share is not None:
             geometry = replace(geometry, share=knee.geometry.share)
@@ -428,12 +467,15 @@ class ReleasedKnee:
         last_contact: "ProbedContact | None",
         relaxation: Relaxation,
         stop_distance: float,
+        pull: "tuple[float, Array | None] | None",
     ) -> tuple[KneeEquilibrium, bool]:
         """Return the equilibrium of one pass, and whether the patellar ligament would push."""
         patella, guess = None, before.patella if before else None
         if instant.extensor is not None:
             patella = instant.extensor.patella(knee_pose(coordinates), guess)
         geometry = instant.geometry(coordinates, patella)
+        if not slack:
+            geometry = _pulled(instant, geometry, patella, pull)
         joint = self._joint(instant, geometry, middle, slack)
         muscles = instant.muscles
         if muscles is not None and not geometry.problems:
@@ -450,6 +492,8 @@ class ReleasedKnee:
         balance = forces.balance(
             stiffness, *((RELEASED_KNEE.inner_tolerance_share, stop_distance) if muscles else ())
         )
+        if pull is not None and not muscles:
+            balance = forces.polished(balance, pull[0])
         contact, problem = forces.contact(balance), "; ".join(geometry.problems)
         if balance.status is not BalanceStatus.OK:
             problem = problem or f"released: {balance.status.value}" + (
@@ -465,6 +509,7 @@ class ReleasedKnee:
             balance.trials,
             np.nan,
             problem,
+            pull=forces.line_tension(balance) if contact.known else np.nan,
         )
         # With other muscles, static optimisation decides whether the quadriceps is slack.
         ended = balance.converged or balance.status is not BalanceStatus.OK
@@ -525,6 +570,28 @@ class ReleasedKnee:
             raise ComputationError(f"muscles: {share.status.removeprefix('failed: ')}")
         return share
 
+    @staticmethod
+    def _next_pull(
+        instant: Instant, knee: KneeEquilibrium, slack: bool
+    ) -> "tuple[tuple[float, Array | None] | None, float]":
+        """Return tension and first guess of a released patella in the next pass.
+
+        Returns:
+            Tension of the quadriceps (N) with the patella's coordinates (6,), None: unknown; and
+            the relative change of the tension. The change is 0 with a plane or a slack patella.
+        """
+        extensor, patella = knee.geometry.extensor, knee.patella
+        lost = slack or extensor is None or bool(knee.problem)
+        # A muscle share without quadriceps has a slack ligament.
+        if instant.patella is None or lost or extensor is None or not knee.pull > 0.0:
+            return None, 0.0
+        released = extensor.released
+        if released is None:
+            assert patella is not None
+            return (knee.pull / patella.ligament_ratio, instant.patella_start), np.inf
+        change = knee.pull / released.forces["patellar_ligament"]
+        return (change * released.tension, released.coordinates), abs(change - 1.0)
+
     @property
     def _has_residual_forces(self) -> bool:
         return len(self.released) < 5
@@ -552,6 +619,36 @@ class ReleasedKnee:
     ) -> "ReleasedForces":
         friction = instant.friction
         return ReleasedForces(joint, self._probe, coordinates, friction, instant.sliding, contact)
+
+
+def _pull(geometry: KneeGeometry) -> "tuple[float, Array | None] | None":
+    """Return tension and coordinates of the released patella of a frame; None: it has none."""
+    released = None if geometry.extensor is None else geometry.extensor.released
+    return None if released is None else (released.tension, released.coordinates)
+
+
+def _pulled(
+    instant: Instant,
+    geometry: KneeGeometry,
+    patella: "PatellaState | None",
+    pull: "tuple[float, Array | None] | None",
+    complete: bool = False,
+) -> KneeGeometry:
+    """Return a geometry with the released patella under a tension, if that is known.
+
+    Args:
+        geometry: the frame with the plane patella.
+        patella: the plane patella.
+        pull: tension of the quadriceps, N, and first guess of the coordinates (6,).
+        complete: see `PatellaMethod.pulled`.
+    """
+    if instant.patella is None or pull is None or geometry.extensor is None or geometry.problems:
+        return geometry
+    tension, start = pull
+    assert patella is not None
+    return instant.patella.pulled(
+        geometry, tension, patella.patellofemoral_ratio, start, complete=complete
+    )
 
 
 def remaining_distance(distances: Sequence[float]) -> float:

@@ -18,14 +18,14 @@ is zero at equilibrium, and positive if it drives the femur towards +q_i.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 import numpy as np
 
 from tkamb.geometry.frames import KNEE_COORDINATES, Array, inverse, knee_axes, knee_pose, transform
 from tkamb.knee import unknowns
-from tkamb.knee.balance import Balance, Trial, find_balance
+from tkamb.knee.balance import Balance, BalanceStatus, Trial, find_balance, polished
 from tkamb.knee.crossing import MuscleShare
 from tkamb.knee.equations import KneeGeometry
 from tkamb.knee.load import wrench_of
@@ -55,6 +55,31 @@ class PatellarLine:
 
 
 @dataclass(frozen=True, eq=False)
+class StrandLines:
+    """The ligaments from a released patella to the tibia, with constant shares of their resultant.
+
+    Args:
+        ends: ends on the patella, femur frame, shape (k, 3), m; the patella is fixed to the femur
+            here.
+        anchors: ends on the shank, insert frame, shape (k, 3), m.
+        shares: tension of each over the resultant of all, shape (k,), 1.
+        wrapping: wrench (6,) of the others, which wrap, on the insert, per unit of the resultant.
+    """
+
+    ends: Array
+    anchors: Array
+    shares: Array
+    wrapping: Array
+
+    def wrench(self, poses: Array) -> Array:
+        """Return the wrench (..., 6) of a unit resultant on the insert at poses (..., 4, 4)."""
+        ends = np.einsum("...ij,kj->...ki", poses[..., :3, :3], self.ends)
+        lines = ends + poses[..., None, :3, 3] - self.anchors
+        pulls = self.shares[:, None] * lines / np.linalg.norm(lines, axis=-1, keepdims=True)
+        return wrench_of(self.anchors, pulls).sum(axis=-2) + self.wrapping
+
+
+@dataclass(frozen=True, eq=False)
 class JointEquilibrium:
     """The equations of equilibrium of the released knee coordinates at one frame.
 
@@ -70,7 +95,7 @@ class JointEquilibrium:
 
     external: Array
     ligaments: "BundleArrays"
-    line: PatellarLine | None
+    line: PatellarLine | StrandLines | None
     residual_loads: Array
     released: tuple[int, ...]
     share: MuscleShare | None = None
@@ -203,10 +228,12 @@ def unit_residual(name: str, middle: Array) -> Array:
     return np.concatenate([np.zeros(3), axis])
 
 
-def patellar_line(geometry: KneeGeometry, coordinates: Array) -> PatellarLine:
+def patellar_line(geometry: KneeGeometry, coordinates: Array) -> PatellarLine | StrandLines:
     """Return the first straight segment of the patellar ligament at coordinates (6,)."""
     extensor, chain = geometry.extensor, geometry.state.chain
     assert extensor is not None
+    if extensor.released is not None:
+        return extensor.released.strands(inverse(knee_pose(coordinates)))
     shank_loads = [load for load in extensor.patellar_ligament if chain.on_shank(load.link)]
     other_loads = [load for load in extensor.patellar_ligament if not chain.on_shank(load.link)]
     end, direction = other_loads[0].points[0], other_loads[0].forces[0]
@@ -347,6 +374,14 @@ class FreeForces(Generic[J]):
         """
         return find_balance(self.trial, self._start, stiffness, residual_share, stop_distance)
 
+    def polished(self, balance: Balance, size: float) -> Balance:
+        """Return a balance after more steps, until the residual is small against a load, N."""
+        if balance.status is not BalanceStatus.OK:
+            return balance
+        x, last = polished(self.trial, balance.coordinates, size)
+        stiffness = balance.stiffness if last.stiffness is None else last.stiffness
+        return replace(balance, coordinates=x, force=last.force, stiffness=stiffness)
+
     def contact(self, balance: Balance) -> "ProbedContact":
         """Return the contact of a balance."""
         return self.contacts[balance.coordinates.tobytes()]
@@ -454,8 +489,12 @@ class ReleasedForces(FreeForces[JointEquilibrium]):
 
     def pushes(self, balance: Balance) -> bool:
         """Return whether a taut patellar ligament would have to push."""
+        return self.line_tension(balance) < 0
+
+    def line_tension(self, balance: Balance) -> float:
+        """Return the tension of the patellar ligament, N; 0: slack, or not modelled."""
         if self._joint.line is None:
-            return False
+            return 0.0
         coordinates = self.at(balance)
         wrench, _ = self._with_friction(coordinates, self.contact(balance))
-        return bool(self._joint.reactions(coordinates, wrench)[-1] < 0)
+        return float(self._joint.reactions(coordinates, wrench)[-1])

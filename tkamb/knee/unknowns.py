@@ -210,7 +210,9 @@ def patellofemoral(point: Array, normal: Array, femur_ml: Array) -> list[Unknown
 
 
 def unloaded_patella(point: Array, femur_ml: Array) -> list[Unknown]:
-    """Return the loads that balance the patella's weight if the extensor mechanism is slack.
+    """Return the loads that balance the patella's weight if no other loads do.
+
+    These are the loads of a slack extensor mechanism and of a released, massless patella.
 
     Args:
         point: contact point on the femur, shape (3,), m.
@@ -344,7 +346,8 @@ def contradictions(
     wrong = wrong_signs(state, solutions[state])
     if state.slack:
         taut = solutions[LoadState(state.lifted, frozenset())].values
-        pulls = {name: taut[name] for name in (*_muscles(taut), "patellar_ligament")}
+        names = (*_muscles(taut), "patellar_ligament")  # the latter only with a plane patella
+        pulls = {name: taut[name] for name in names if name in taut}
         if not min(pulls.values()) < -FORCE_ROUNDING:
             name, pull = next(iter(pulls.items()))
             wrong.append(f"{name.removeprefix(MUSCLE)} would pull with {pull:.3g} N")

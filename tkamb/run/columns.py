@@ -112,18 +112,22 @@ COLUMNS: tuple[Column, ...] = (
     Column("medial_force_equilibrium_N", "normal force on the medial condyle, by equilibrium"),
     Column("lateral_force_equilibrium_N", "normal force on the lateral condyle, by equilibrium"),
     Column("quadriceps_N", "quadriceps tension", _MUSCLE),
-    Column("patellar_ligament_N", "patellar-ligament tension", _MUSCLE),
+    Column(
+        "patellar_ligament_N",
+        "patellar-ligament tension; [patella] released: resultant of its ligaments to the tibia",
+        _MUSCLE,
+    ),
     Column("patellofemoral_N", "patellofemoral force along the contact normal", _MUSCLE),
     Column(
         "patellofemoral_tangential_N",
-        "patellofemoral force across the contact normal; near zero",
+        "patellofemoral force across the contact normal; near zero; [patella] released: zero",
         _MUSCLE,
     ),
     Column("quadriceps_wrap_deg", "angle over which the quadriceps wraps the femur", _MUSCLE),
     Column(
         "quadriceps_per_dome_mm_N",
         "change of quadriceps_N if the button is mounted 1 mm higher on the patella, at the same "
-        "pose of the patella",
+        "pose of the plane patella",
         _MUSCLE,
     ),
     Column(
@@ -340,7 +344,7 @@ COLUMNS: tuple[Column, ...] = (
             (
                 "force_N",
                 "contact force on the patellar button, magnitude; its vector is patellofemoral_N "
-                "along the contact normal, except for a force along the patella's z axis",
+                "along the contact normal, except for a force along a plane patella's z axis",
             ),
             ("medial_force_N", "normal force on the medial facet of the button"),
             ("lateral_force_N", "normal force on the lateral facet of the button"),
@@ -353,7 +357,8 @@ COLUMNS: tuple[Column, ...] = (
             (
                 "imbalance_N",
                 "sagittal difference of the contact's force and the patellofemoral force of the "
-                "equations, at the patella's pose; zero in exact equilibrium",
+                "equations, at the patella's pose; zero in exact equilibrium; [patella] released: "
+                "force on coordinates that are not released",
             ),
             (
                 "thickness_mm",

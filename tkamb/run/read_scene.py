@@ -122,9 +122,9 @@ def recording_of(
         strains = strain_table(bundles, links, flexion, STRAIN_FLEXIONS)
     motion = _motion(case, extensor)
     muscles = shared.muscles if shared else _muscles(case)
-    ground, method = _ground(case, motion), _method(case, knee, split_sensitivity, cam)
     if patella_lines:
-        method = replace(method, patella=_patella_method(case, knee, patella_lines))
+        knee = knee._with_patella(_patella_method(case, knee, patella_lines))
+    ground, method = _ground(case, motion), _method(case, knee, split_sensitivity, cam)
     return Recording(method, motion, ground, extensor, muscles, strains)
 
 

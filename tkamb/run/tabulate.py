@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     from tkamb.io.recordings.marker_motion import MarkerKinematics
     from tkamb.knee.button import ButtonPress
     from tkamb.knee.crossing import MuscleShare
+    from tkamb.knee.found_patella import FoundPatella
     from tkamb.knee.frame import Frame
-    from tkamb.knee.patella_equilibrium import FoundPatella
     from tkamb.knee.slip import CondyleSlip
     from tkamb.knee.unknowns import CondylePoint
 

@@ -360,13 +360,15 @@ class PatellaTable(SceneTable):
     """The patella's sagittal motion: recorded, or solved from equilibrium.
 
     With `released` the patella leaves this plane pose: these coordinates are found in equilibrium
-    of the heads of the quadriceps, the ligaments of the patella and the contact of the button. The
-    equations of the knee keep the plane patella and its inextensible ligament.
+    of the heads of the quadriceps, the ligaments of the patella and the contact of the button. Its
+    forces act in the equations of the knee. The plane patella is the initial guess.
     """
 
     motion: Literal["recorded", "solved"]
     released: tuple[PatellaFreedom, ...] = Field(
-        (), description="coordinates of the patella in equilibrium; needs [contact.patellofemoral]"
+        (),
+        description="coordinates of the patella in equilibrium: ap, si, flexion and perhaps "
+        "others; needs [contact.patellofemoral]",
     )
     head: tuple[PatellaHeadTable, ...] = Field(
         (), description="heads of the quadriceps; default: the line of [quadriceps] alone"
@@ -374,7 +376,7 @@ class PatellaTable(SceneTable):
     ligament: tuple[LigamentTable, ...] = Field(
         (),
         description="strands of the patellar ligament (patella to tibia) and retinacula (patella "
-        "to femur or tibia); they act on the released patella only",
+        "to femur or tibia) of a released patella",
     )
 
     @model_validator(mode="after")
@@ -384,6 +386,8 @@ class PatellaTable(SceneTable):
         names = [one.name for one in self.head] + [one.name for one in self.ligament]
         if len(set(names)) < len(names) or len(set(self.released)) < len(self.released):
             raise ValueError("a head, ligament or released coordinate is named twice")
+        if self.released and not {"ap", "si", "flexion"} <= set(self.released):
+            raise ValueError("'released' needs ap, si and flexion: the quadriceps moves them")
         if self.head and abs(sum(head.share for head in self.head) - 1.0) > 1e-6:
             raise ValueError("the shares of the heads do not sum to 1")
         return self

@@ -217,6 +217,55 @@ def extensor_questions(case: Case, poses: Mapping[str, Array]) -> Iterator[Quest
     yield from _tendon(lengths[np.isfinite(lengths)], ligament.length)
 
 
+def side_questions(case: Case) -> Iterator[Question]:
+    """Ask about heads and ligaments of a released patella on the wrong side of it.
+
+    The side is that of the name, or without such a name that of the other end.
+    """
+    ends = [
+        (head.name, f"[[patella.head]] {head.name} insertion", head.insertion, head.origin)
+        for head in case.patella_heads
+    ]
+    for bundle in case.patella_ligaments:
+        proximal, distal = bundle.proximal, bundle.distal
+        on_patella = case.chain.carrier(proximal.link) == "patella"
+        if not on_patella:
+            proximal, distal = distal, proximal
+        which = "proximal" if on_patella else "distal"
+        ends.append((bundle.name, f"[[patella.ligament]] {bundle.name} {which}", proximal, distal))
+    odd = []
+    for name, where, end, other in ends:
+        here, there = (_on_carrier(case, one)[1][2] for one in (end, other))
+        side = named_side(name) or np.sign(there) * (abs(there) > FAR_SIDE)
+        if side * here < -NEAR_SIDE:
+            odd.append(f"{where}, {abs(here) / MILLIMETRE:.0f} mm {_side_of(here)}")
+        elif named_side(name) * there < -FAR_SIDE:
+            odd.append(
+                f"{where}: its other end, {abs(there) / MILLIMETRE:.0f} mm {_side_of(there)}"
+            )
+    if odd:
+        yield Question(
+            f"{some(odd)}: on the other side of the patella than its name or its other end says; "
+            "is the sign of z in point_mm (to the right in both knees), or the name, wrong?",
+            "line of the patella on the wrong side",
+        )
+
+
+NEAR_SIDE, FAR_SIDE = 0.001, 0.008
+"""m: distance from the middle beyond which an end on the patella, and one on femur or tibia, is on
+a side. The tuberosity of a symmetric knee is not far from the middle."""
+
+
+def _side_of(place: float) -> str:
+    return "lateral" if place > 0.0 else "medial"
+
+
+def named_side(name: str) -> int:
+    """Return 1 if the name is that of a lateral part, -1 of a medial one, else 0."""
+    medial, lateral = "medial" in name.lower(), "lateral" in name.lower()
+    return int(lateral) - int(medial)
+
+
 def _tendon(lengths: Array, declared: float) -> Iterator[Question]:
     """Ask about unlikely lengths (f,), m, of the patellar ligament, or a wrong length_mm."""
     if not len(lengths):

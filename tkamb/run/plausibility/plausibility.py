@@ -117,8 +117,10 @@ def _line_questions(case: Case, recording: "Recording") -> list[Question]:
 
     result = [*lines.attachment_questions(case), *lines.stiffness_questions(case)]
     poses = link_poses(case, recording.poses, recording.extensor)
-    result += lines.extensor_questions(case, poses)
+    result += [*lines.extensor_questions(case, poses), *lines.side_questions(case)]
+    patella = recording.knee.patella
+    bundles = (*recording.ligaments, *(patella.lines if patella else ()))
     if not (case.scene.contact and case.scene.contact.released):
-        strains = {b.name: b.strain(b.length(poses)) for b in recording.ligaments}
-        result += lines.strain_questions(recording.ligaments, strains, case.motion.time)
+        strains = {b.name: b.strain(b.length(poses)) for b in bundles}
+        result += lines.strain_questions(bundles, strains, case.motion.time)
     return result

@@ -138,10 +138,20 @@ def _distal_end(geometry: KneeGeometry, name: str) -> tuple[Array, Array]:
     """Return the distal end (3,) of a tendon, m, and its force (3,) there per N of tension."""
     if geometry.extensor is None:
         return NOTHING, NOTHING
+    released = geometry.extensor.released
+    if released is not None:
+        on_tibia = next(load for load in released.lines if load.link == "tibia")
+        return _resultant(released.heads if name == "quadriceps" else on_tibia)
     (muscle,) = geometry.muscles
     loads = muscle.loads if name == "quadriceps" else geometry.extensor.patellar_ligament
     end: PointForces = loads[1]
     return end.points[0], end.forces[0]
+
+
+def _resultant(load: PointForces) -> tuple[Array, Array]:
+    """Return the mean point (3,) of parallel pulls, m, and the direction (3,) of their sum."""
+    sizes, total = np.linalg.norm(load.forces, axis=1), load.forces.sum(axis=0)
+    return np.average(load.points, axis=0, weights=sizes), total / np.linalg.norm(total)
 
 
 def _patella(geometry: KneeGeometry) -> tuple[Array, Array, Array]:

@@ -60,7 +60,8 @@ class CaseResults:
 
     def _geometry(self, k: int, row: int | None) -> KneeGeometry:
         maps, recording = self.results.maps, self.recording
-        if maps is None or row is None or recording.muscles is not None:
+        lasting = recording.muscles is None and recording.knee.patella is None
+        if maps is None or row is None or not lasting:
             return recording.loads(k).geometry
         instant = recording.instant(k)
         points, normals = maps.contact_points_m[row], maps.contact_normals[row]
