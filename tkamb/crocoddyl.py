@@ -60,8 +60,8 @@ class KneeDynamics(crocoddyl.DifferentialActionModelAbstract):
             `pin.aba`; None: zero.
 
     Raises:
-        InputError: the state is that of another model, or the costs have another number of
-            controls.
+        InputError: the state is that of another model, the costs have another number of controls,
+            or a muscle is a head of a released patella.
     """
 
     def __init__(
@@ -81,6 +81,9 @@ class KneeDynamics(crocoddyl.DifferentialActionModelAbstract):
             raise InputError(
                 f"nu is {costs.nu}", "costs", f"give {count}: the actuation, then the muscles"
             )
+        if knee.patella is not None and knee._pulls(dict.fromkeys(muscles, 1.0)):
+            words = "a head of a released patella is no control: its forces are not linear in it"
+            raise InputError(words, "muscles", "give its tension in tensions=")
         super().__init__(state, count, costs.nr)
         knee._tensions(dict.fromkeys(muscles, 0.0) | dict(tensions or {}))
         self.knee, self.actuation, self.costs = knee, actuation, costs
