@@ -1,4 +1,4 @@
-"""Documentation: quoted messages exist, command lines and links are valid, lists are complete."""
+"""Documentation: messages, commands, links, lists and DOIs are valid; the site stands alone."""
 
 import re
 import shlex
@@ -123,3 +123,52 @@ def test_the_architecture_shows_the_way_of_a_frame():
     assert files == traced, "run scripts/make/frame_trace"
     assert f"It enters {len(files)} files" in shown
     assert not any(name.strip().startswith("io/") for name in files)
+
+
+@pytest.mark.slow
+def test_the_site_is_built_without_a_warning_and_is_self_contained(tmp_path):
+    pytest.importorskip("material", reason="mkdocs-material is not installed")
+    pytest.importorskip("mkdocstrings", reason="mkdocstrings is not installed")
+    build = ["mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
+    config = ["--config-file", str(ROOT / "scripts" / "mkdocs.yml")]
+    done = subprocess.run(
+        [sys.executable, "-m", *build, *config], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    pages = list((tmp_path / "site").glob("**/*.html"))
+    assert len(pages) > 25
+    loads = re.compile(
+        r'<(?:script|img)[^>]* src="(http[^"]*)"|<link[^>]*stylesheet[^>]*"(http[^"]*)"'
+    )
+    for page in pages:
+        assert not loads.search(page.read_text(encoding="utf-8")), page
+    assert (tmp_path / "site" / "gallery" / "press_two_meshes.png").is_file()
+    assert "simulate" in (tmp_path / "site" / "api.html").read_text(encoding="utf-8")
+
+
+PAGE = ROOT / "docs" / "references.md"
+DOI = re.compile(r"10\.\d{4,}/(?:\([^\s()]*\)|[^\s\"'`;,()])+")
+
+
+def dois(text):
+    """Return the DOIs of a text, with inner parentheses but without punctuation after them."""
+    return {match.rstrip(".") for match in DOI.findall(text)}
+
+
+def test_a_doi_may_contain_parentheses():
+    text = "(Lu, doi:10.1016/S0021-9290(98)00158-4; Johnson, doi:10.1017/CBO9781139171731)."
+    assert dois(text) == {"10.1016/S0021-9290(98)00158-4", "10.1017/CBO9781139171731"}
+
+
+def test_the_bibliography_has_the_dois_of_the_code():
+    code = [path.read_text(encoding="utf-8") for path in (ROOT / "tkamb").rglob("*.py")]
+    cited = dois("\n".join(code))
+    assert len(cited) > 20
+    assert dois(PAGE.read_text(encoding="utf-8")) == cited
+
+
+def test_entries_are_sorted_by_author_and_year():
+    entries = [line for line in PAGE.read_text(encoding="utf-8").splitlines() if line[:2] == "- "]
+    authors = [entry[2:].split(" (")[0].lower() for entry in entries]
+    assert authors == sorted(authors)
+    assert all(re.match(r"- .+ \(\d{4}\)\. .+\.", entry) for entry in entries)

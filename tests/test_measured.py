@@ -1,15 +1,20 @@
 """Comparison of measured and predicted forces: clock, sums, gaps, errors and frame counts."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from jw_gait import needs_jw
 from synthetic_run import make_run
 from tkamb.errors import InputError
 from tkamb.io.recordings.measured import load_measured_force
 from tkamb.io.recordings.recording_tables import MeasuredTable
+from tkamb.run.columns import CONTRIBUTIONS, belongs
 from tkamb.run.recorded import compare_measured, comparison_words, measured_column
 from tkamb.run.results import Results
+from tkamb.run.simulation import simulate
 from tkamb.show.axis import horizontal_axis
 from tkamb.show.headline import cards
 from tkamb.show.panels import panels
@@ -144,3 +149,23 @@ def test_the_report_draws_the_measured_force_behind_the_prediction():
     assert card.warning
     for words in ("34 of 40 frames compared", "2 failed", "3 without measurement", "r 1.00"):
         assert words in card.detail
+
+
+SCENE = Path(__file__).parents[1] / "models" / "jw" / "ngait_og3_measured.toml"
+LATE_STANCE = 15
+
+
+@pytest.mark.slow
+@needs_jw
+def test_the_results_have_muscle_groups_contributions_measured_force_and_emg():
+    run = simulate(SCENE, frames=slice(LATE_STANCE, LATE_STANCE + 1))
+    groups = run.summary["muscle_groups"]
+    assert set(groups["knee extensors"]) == {"recfem", "vasint", "vaslat", "vasmed"}
+    assert set(groups["thigh to foot"]) == {"gaslat", "gasmed"}
+    for side, family in CONTRIBUTIONS.items():
+        parts = [run[name] for name in run.columns if belongs(name, family)]
+        np.testing.assert_allclose(sum(parts), run[f"{side}_force_equilibrium_N"], atol=1e-6)
+    assert run.summary["measured"]["total"]["frames_compared"] == 1
+    emg = run.summary["emg"]["muscles"]
+    assert {f"envelope_{name}" for name in emg} <= set(run.columns)
+    assert all(one["frames_compared"] == 1 for one in emg.values())

@@ -1,12 +1,16 @@
 """Every option has an effect, or a rule refuses it where it has none."""
 
 import argparse
+import os
 import shlex
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
 from pendulum_leg import changed, recorded_leg
+from scenes import fast_scene
 from tkamb.cli import _parser, main
 from tkamb.commands.options import EXAMPLES, RULES, Rule, check_options, leaf_parsers
 from tkamb.io.recordings.tables import read_table
@@ -255,3 +259,37 @@ def test_the_rules_name_existing_options():
         names = set(options_of(PARSERS[command]))
         for rule in rules:
             assert {rule.option, *rule.needs, *rule.excludes} <= names
+
+
+SCENE = fast_scene()
+
+
+@pytest.mark.slow
+def test_no_cache_writes_no_cache(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("TKAMB_CACHE_DIR", str(tmp_path / "kept"))
+    run = ["run", str(SCENE), "--frames", "50:51", "--resolution", "1.5", "--contact"]
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert main([*run, "lattice-linear", "--out", str(first), "--no-cache"]) == 0
+    assert not (tmp_path / "kept").exists()
+    assert main([*run, "lattice-linear", "--out", str(second)]) == 0
+    assert any((tmp_path / "kept").iterdir())
+    assert main([*run, "foundation", "--out", str(tmp_path / "third"), "--no-cache"]) == 2
+    assert "'foundation' has no cache on disk" in capsys.readouterr().err
+    assert not (tmp_path / "third").exists()
+
+
+@pytest.mark.parametrize(("setting", "threads"), [({}, "1"), ({"OMP_NUM_THREADS": "3"}, "3")])
+def test_blas_uses_one_thread_unless_the_environment_sets_a_number(setting, threads):
+    code = (
+        "import os, sys; from tkamb.cli import main; main(['contact', 'list']); "
+        "print(os.environ['OMP_NUM_THREADS'])"
+    )
+    environment = {k: v for k, v in os.environ.items() if not k.endswith("_NUM_THREADS")}
+    process = subprocess.run(
+        [sys.executable, "-c", code],
+        env=environment | setting,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert process.stdout.splitlines()[-1] == threads

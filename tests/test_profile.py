@@ -1,10 +1,12 @@
-"""`tkamb run --profile`: times, files and modules of a run."""
+"""The stages of a run on a terminal, and `tkamb run --profile`: times, files and modules."""
 
+import io
 import json
+import re
 
 from scenes import write_scene
 from tkamb.cli import main
-from tkamb.run.timing import Profile
+from tkamb.run.timing import Profile, Stages
 
 
 def profiled(folder, drop, capsys, *options):
@@ -57,3 +59,28 @@ def test_the_profile_lists_only_files_that_are_read(tmp_path):
     (tmp_path / "read").read_text()
     opened = [path for path in profile.opened if path.parent == tmp_path]
     assert opened == [tmp_path / "read"]
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def run_through(stream):
+    """Return the output of three stages, the second with four frames, the third with two plots."""
+    with Stages(3, stream) as stages:
+        stages.begin("reading")
+        assert list(stages.frames(range(4))) == [0, 1, 2, 3]
+        assert list(stages.plots("ab")) == ["a", "b"]
+    return stream.getvalue()
+
+
+def test_a_terminal_shows_each_stage_with_its_time_or_a_progress_bar():
+    output = run_through(Terminal())
+    assert re.search(r"1/3 reading … \d+\.\d s\n", output)
+    assert re.search(r"2/3 computing frames: 100%.*4/4 \[\d\d:\d\d<\d\d:\d\d", output)
+    assert re.search(r"3/3 writing results and report: 100%.*2/2 \[\d\d:\d\d<", output)
+
+
+def test_a_pipe_gets_no_output():
+    assert run_through(io.StringIO()) == ""

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tracemalloc
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -21,6 +22,7 @@ from tkamb.run.maps import ContactMaps, MapWriter, read_maps, write_maps
 from tkamb.run.metrics import map_rows
 from tkamb.run.results import Results, csv_rows, read_csv
 from tkamb.run.results_folder import read_results, write_results
+from tkamb.run.summary import notes_of
 from tkamb.run.tabulate import RowTable
 
 ROOT = Path(__file__).parents[1]
@@ -248,3 +250,10 @@ def test_a_row_table_has_the_rows_in_the_order_of_the_frames():
     assert columns["time_s"].tolist() == [0.2, 0.4] and columns["status"] == ["failed: x", "ok"]
     assert columns["flexion_deg"][0] == 5.0 and np.isnan(columns["flexion_deg"][1])
     assert len(table) == 2 and 2 in table and 3 not in table
+
+
+def test_a_scene_with_muscles_has_no_note_on_missing_muscles():
+    notes = ["Without [muscles] only the quadriceps acts.", "Skin moves."]
+    output = SimpleNamespace(notes=notes)
+    assert notes_of(SimpleNamespace(output=output, muscles=None)) == notes
+    assert notes_of(SimpleNamespace(output=output, muscles=object())) == ["Skin moves."]
