@@ -18,7 +18,7 @@ API = (
     "run.simulation.simulate", "io.scene.scene.load_scene", "io.scene.scene.Scene",
     "run.results.Results", "run.results_folder.read_results", "run.maps.ContactMaps",
     "knee.knee.Knee", "run.read_scene.read_scene", "run.press.press_meshes",
-    "run.press.PressReport", "show.check.scene_check", "show.compare.comparison",
+    "run.press.PressReport", "show.scene_check.check_scene", "show.comparison.compare_folders",
     "contact.registry.contact_model", "contact.model", "contact.result.ContactResult",
     "contact.pair", "testing", "errors",
 )  # fmt: skip
