@@ -23,7 +23,7 @@ from tkamb.knee import patella_search
 
 TOLERANCE = 1e-5
 """Relative error of a column, see `errors`."""
-SHORT, LONG = (1e-9, 1e-8), (1e-7, 1e-6)
+SHORT, LONG = (1e-9, 1e-8), (1e-8, 1e-7, 1e-6)
 """m: steps of central differences with and without contact."""
 RATES = (1e-6, 1e-5)
 """m/s: steps in v; the friction bends within 1 mm/s."""
@@ -277,9 +277,7 @@ def lattice_case(read, name, newton):
     options = {"tolerance": 1e-9, "newton": newton, "cache": False}
     resolution = 3e-3 if newton else 2e-3
     knee = knee_of(read[0], name, resolution, options)
-    # Without Newton's method the iteration stops before it follows a shorter step.
-    steps = (SHORT[1], *LONG) if newton else LONG
-    return Case(knee, lambda count: random_states(read, knee, count), steps=steps)
+    return Case(knee, lambda count: random_states(read, knee, count), steps=LONG)
 
 
 def hamstrings(plain):

@@ -52,15 +52,16 @@ if TYPE_CHECKING:
     from tkamb.knee.patella import PatellaState
 
 
-# m: step of the femur's pose. Chosen because rounding errors are below 1e-9 and the error of the
-# difference is below 1e-8 of the derivative.
-POSE_STEP = 1e-6
-# m: step of the patella's coordinates. Chosen shorter, because the facets under the button are
-# short.
-PATELLA_STEP = 1e-7
+# m: step of the femur's pose. Rounding errors and the error of the difference are below 1e-7 of the
+# derivative.
+POSE_STEP = 1e-7
+# m: step of the patella's coordinates. Shorter, because the facets under the button are short.
+PATELLA_STEP = 1e-8
 # 1: relative difference of one-sided differences from which an edge of a facet lies between them.
-# Measured in 30 states: median 4e-5 by `POSE_STEP` and 5e-6 by `PATELLA_STEP`.
-EDGE = 3e-4
+# Without an edge it is proportional to the step: in 30 states its median was 4e-5 by ten times
+# `POSE_STEP` and 5e-6 by ten times `PATELLA_STEP`. An edge that is not noticed makes an error of at
+# most half of it.
+EDGE = 1e-5
 # m: lever arm; a rotation's step is the step over this arm. Chosen as half the distance of the
 # condyles.
 FORCE_DERIVATIVE_ARM = 0.025
