@@ -23,7 +23,7 @@ from tkamb.knee import patella_search
 
 TOLERANCE = 1e-5
 """Relative error of a column, see `errors`."""
-SHORT, LONG = (1e-9, 1e-8), (1e-8, 1e-7, 1e-6)
+SHORT, LONG = (1e-9, 1e-8), (1e-9, 1e-8, 1e-7, 1e-6)
 """m: steps of central differences with and without contact."""
 RATES = (1e-6, 1e-5)
 """m/s: steps in v; the friction bends within 1 mm/s."""
@@ -141,7 +141,7 @@ class Agreement:
 def agreement(values, computed, knee, q, v, steps=SHORT):
     """Compare derivatives by q and v with differences.
 
-    Of each column the better of two steps counts: the longer one has less rounding, the shorter one
+    Of each column the best of all steps counts: the longer one has less rounding, the shorter one
     meets fewer kinks. A column by q that misses `TOLERANCE` lies on a kink if its one-sided
     differences differ by more than that, and one of them agrees.
     """
@@ -170,7 +170,7 @@ def agreement(values, computed, knee, q, v, steps=SHORT):
 def direction_agreement(values, computed, knee, q, v, steps=SHORT):
     """Compare derivatives along one random direction of q, and of v, with differences.
 
-    The better of two steps counts, and a miss by q may lie on a kink, as in `agreement`.
+    The best of all steps counts, and a miss by q may lie on a kink, as in `agreement`.
     """
     model, rng = knee.model, np.random.default_rng(int(1e6 * abs(q[-1])) % 1000)
     unit = rng.choice([-1.0, 1.0], model.nv) * rng.uniform(0.5, 1.0, model.nv)

@@ -14,7 +14,7 @@ from tkamb.contact.model import CondyleWrench, ContactModel, ProbedContact
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.result import ContactStatus, Guess
 from tkamb.errors import ComputationError, InputError
-from tkamb.geometry.compiled import compiled_as_written
+from tkamb.geometry.compiled import compiled_as_written, compiled_for_microseconds
 from tkamb.geometry.frames import Array, displaced
 from tkamb.knee.unknowns import CONTACT_POINT
 
@@ -205,7 +205,7 @@ class KneeContact:
 Vector = tuple[float, float, float]
 
 
-@compiled_as_written
+@compiled_for_microseconds
 def _friction_wrench(
     wrench: Array, centre: Array, twist: Array, changes: Array, friction: float, still: float
 ) -> Array:

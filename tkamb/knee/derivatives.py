@@ -66,7 +66,7 @@ EDGE = 1e-5
 # condyles.
 FORCE_DERIVATIVE_ARM = 0.025
 # m and rad: step of q for the twist of a model with mimic joints, for which Pinocchio has no
-# velocity derivatives. Chosen as `POSE_STEP`.
+# velocity derivatives. J(q) is smooth.
 JOINT_STEP = 1e-6
 
 
