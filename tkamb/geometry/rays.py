@@ -36,6 +36,7 @@ PARALLEL = 1e-9
 DEEPEST = 64
 """Largest number of boxes on the stack of a search: one per level of the tree."""
 NO_TRIANGLE = -1
+"""Number in place of a triangle where a ray crosses none."""
 
 
 # m: distance below which two shells touch. It is above the rounding of a mesh.
