@@ -256,12 +256,12 @@ class Bridge:
         Args:
             data: Pinocchio data of the user's model, with placements and velocities up to date.
         """
-        insert = data.oMi[self.insert.joint] * self.insert.placement
-        total = np.zeros(6)
-        for frame, sign in ((self.component, 1.0), (self.insert, -1.0)):
-            if frame.joint:
-                to_insert = insert.actInv(data.oMi[frame.joint])
-                total += sign * to_insert.act(data.v[frame.joint]).vector
+        total, joint = np.zeros(6), self.component.joint
+        if joint:
+            insert = data.oMi[self.insert.joint] * self.insert.placement
+            total += insert.actInv(data.oMi[joint]).act(data.v[joint]).vector
+        if self.insert.joint:
+            total -= self.insert.placement.actInv(data.v[self.insert.joint]).vector
         return mirrored_spatial(total) if self.left else total
 
     def motion(self, data: Any, patella: bool) -> ChainMotion:
@@ -457,12 +457,13 @@ class Bridge:
         Returns:
             `pin.StdVec_Force`, one per joint, each in its joint's frame.
         """
-        forces = [pin.Force.Zero() for _ in range(self.anatomy.model.njoints)]
+        forces = [pin.Force.Zero()] * self.anatomy.model.njoints
         insert = data.oMi[self.insert.joint] * self.insert.placement
         for link, wrench in summed(loads).items():
             joint = self.joint_of(link)
             user_wrench = mirrored_spatial(wrench) if self.left else wrench
-            forces[joint] += data.oMi[joint].actInv(insert).act(pin.Force(user_wrench))
+            force = data.oMi[joint].actInv(insert).act(pin.Force(user_wrench))
+            forces[joint] = forces[joint] + force
         return pin.StdVec_Force(forces)
 
     def joint_of(self, link: str) -> int:

@@ -14,6 +14,7 @@ J Biomech Eng 113:263 (1991), doi:10.1115/1.2894883 (strains at extension).
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,7 +24,7 @@ from tkamb.geometry.frames import Array, cross_matrix, inverse, transform
 from tkamb.geometry.surface import Surface
 from tkamb.knee.chain import Chain
 from tkamb.knee.ligament_laws import LIGAMENT_LAWS, LigamentLaw, StackedLaws, TwoLine
-from tkamb.knee.load import LinkPoint, PointForces, wrench_of
+from tkamb.knee.load import LinkPoint, PointForces
 from tkamb.knee.wrap_object import WrapObject
 from tkamb.units import DEGREE, MILLIMETRE
 
@@ -228,8 +229,14 @@ class BundleArrays:
         """
         proximal = self.proximal @ poses[..., :3, :3].swapaxes(-1, -2) + poses[..., None, :3, 3]
         _, pull = self.pulls(proximal, self.distal)
-        total = wrench_of(self.distal, pull).sum(axis=-2)
+        moment = pull.reshape(*pull.shape[:-2], -1) @ self._levers
+        total = np.concatenate([pull.sum(axis=-2), moment], axis=-1)
         return total + self._wrapping_wrench(poses) if self.wrapping else total
+
+    @cached_property
+    def _levers(self) -> Array:
+        """Matrix (3 m, 3) that maps the m pulls on the distal ends to their moment."""
+        return cross_matrix(self.distal).swapaxes(1, 2).reshape(-1, 3)
 
     def _wrapping_wrench(self, poses: Array) -> Array:
         from tkamb.knee.ligament_paths import taut_wrenches  # imports numba
