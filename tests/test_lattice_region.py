@@ -9,7 +9,7 @@ from lattice_bodies import condyles, dished_insert, pair
 from tkamb.contact.lattice.initial_guess import LatticeStart, initial_guess, lattice_start
 from tkamb.contact.lattice.linear import compliance
 from tkamb.contact.lattice.linear.compliance import ComplianceCache, by_component, unknowns_of
-from tkamb.contact.lattice.nonlinear_balance import largest_shares
+from tkamb.contact.lattice.nonlinear_balance import Residual, largest_shares
 from tkamb.contact.lattice.problem import Region, undeformed
 from tkamb.contact.lattice.settings import LatticeSolverSettings
 from tkamb.contact.lattice.solver import solve
@@ -180,6 +180,42 @@ def test_the_stored_compliance_can_grow_in_any_order(state, monkeypatch):
         displacement = cache.displacement(nodes[[1, 3, 6]], nodes[[2, 3]], force)
         exact = np.einsum("aibj,jb->ia", whole[:, [1, 3, 6]][..., [2, 3]], force)
         assert displacement == pytest.approx(exact, rel=1e-4, abs=1e-6 * np.abs(exact).max())
+
+
+@pytest.mark.parametrize("model", ["lattice"], indirect=True)
+def test_a_step_that_continues_the_last_one_begins_at_the_extrapolated_state(model, state):
+    def pose(x, z=0.0):
+        return POSE @ knee_pose([x, 0.0, z, 0.0, 0.0, 0.0])
+
+    _, first = model.press_from(state, LOAD, pose(0.0))
+    _, second = model.press_from(state, LOAD, pose(2e-4), first)
+    assert second.before.loads is first.loads and second.before.before is None
+    for x in (3e-4, 4e-4):
+        share = (x - 2e-4) / 2e-4
+        start = second.extrapolated(pose(x))
+        assert start.loads == pytest.approx(second.loads + share * (second.loads - first.loads))
+        exact = state.problem.operator.start(start.loads)  # L⁻¹ h by a half-solve
+        assert start.half == pytest.approx(exact, rel=1e-6, abs=1e-6 * np.abs(exact).max())
+    for other in (pose(1e-4), pose(2e-4, 2e-4)):  # backwards and sideways
+        assert second.extrapolated(other) is second
+    result, third = model.press_from(state, LOAD, pose(4e-4), second)
+    cold = model.press(state, LOAD, pose(4e-4))
+    assert third.before.loads is second.loads and result.iterations <= cold.iterations
+    assert result.approach == pytest.approx(cold.approach, rel=5e-4)
+    assert result.pressure.max() == pytest.approx(cold.pressure.max(), rel=2e-3)
+
+
+def test_the_peak_grows_by_the_residual_of_the_nodes_with_the_largest_forces():
+    force, field = (
+        np.array([[0.0, -10.0, 0.0], [6.0, -8.0, 0.0], [0.0, -5.0, 0.0]]),
+        np.ones((4, 3)),
+    )
+    for node, size, expected in ((1, 0.02, 2e-3), (3, 5.0, 0.0), (3, 5.5, 0.05), (0, 9.0, 0.0)):
+        r = np.zeros((4, 3))
+        r[node, 2] = size
+        residual = Residual.of(r, field, force, field[1:], np.array([1, 2, 3]), 1.0)
+        assert residual.peak == pytest.approx(expected, abs=1e-12)
+        assert not replace(residual, force=0.0, work=0.0, peak=2e-3).within(LatticeSolverSettings())
 
 
 def test_a_warm_start_of_another_insert_is_not_used(state):

@@ -20,9 +20,11 @@ springs. So the patch test is exact for sheared cells too.
 
 from collections.abc import Iterator
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sparse
+from numpy.typing import NDArray
 
 from tkamb.contact.lattice.meshing.cells import CORNERS, PAIR_AXES, PAIRS
 from tkamb.contact.lattice.solid import LEAST_STRAIN, ShearCurve, Solid, chunks
@@ -31,8 +33,10 @@ from tkamb.geometry.compiled import compiled
 from tkamb.geometry.frames import Array, Index
 from tkamb.geometry.threads import in_halves
 
-LEAST_DIVISOR = 1e-300
-"""m²: smallest divisor, against division by zero."""
+# Coordinates of a cube's corners, -1 or 1.
+_SIGNS = 2.0 * CORNERS - 1.0
+HOURGLASS_MODES = np.stack([*(_SIGNS * np.roll(_SIGNS, 1, axis=1)).T, _SIGNS.prod(axis=1)])
+"""H (4, 8): displacements of a cube's corners along an axis without a mean gradient."""
 
 
 @compiled
@@ -80,30 +84,36 @@ def deviatoric_matrices(
 
 
 @compiled
-def _split_displacement(
-    x: Array, g: Array, nodes: Index, displacement: Array, u: Array, excess: Array
-) -> tuple[float, float, float, float, float, float, float, float, float]:
-    """Return the mean gradient G = sum u_i g_iᵀ of a cell row by row; write u and u - G x.
+def hourglass_shapes(
+    corners: Array, gradients: Array, springs: Array, pairs: Index, modes: Array
+) -> tuple[Array, NDArray[Any]]:
+    """Return gamma (c, 4, 8) and S (c, 12, 12) of cells, with Pᵀ K_spr P = gammaᵀ S gamma.
 
-    The eight values of an axis are adjacent in memory, so that they fill the processor's vector
-    registers. G is in nine registers. The arguments are those of `_shear_force`.
+    With the four hourglass modes H (4, 8) of a cube, gamma = (H - (H x) gᵀ)/8 (Flanagan &
+    Belytschko 1981). Along each axis, b = gamma u is zero for every linear field u. So the
+    remainder P u, except for a translation, is P Hᵀ (gamma Hᵀ)⁻¹ b.
+    `deviatoric_matrices` has the other arguments.
+
+    Args:
+        modes: H.
     """
-    first = nodes[0]
-    for i in range(8):
-        node = nodes[i]
-        u[0, i] = displacement[node, 0] - displacement[first, 0]
-        u[1, i] = displacement[node, 1] - displacement[first, 1]
-        u[2, i] = displacement[node, 2] - displacement[first, 2]
-    xx, xy, xz = _along(u[0], g[0]), _along(u[0], g[1]), _along(u[0], g[2])
-    yx, yy, yz = _along(u[1], g[0]), _along(u[1], g[1]), _along(u[1], g[2])
-    zx, zy, zz = _along(u[2], g[0]), _along(u[2], g[1]), _along(u[2], g[2])
-    for i in range(8):
-        excess[0, i] = u[0, i] - (xx * x[0, i] + xy * x[1, i] + xz * x[2, i])
-    for i in range(8):
-        excess[1, i] = u[1, i] - (yx * x[0, i] + yy * x[1, i] + yz * x[2, i])
-    for i in range(8):
-        excess[2, i] = u[2, i] - (zx * x[0, i] + zy * x[1, i] + zz * x[2, i])
-    return xx, xy, xz, yx, yy, yz, zx, zy, zz
+    gamma, stiffness = np.empty((len(corners), 4, 8)), np.empty((len(corners), 12, 12), np.float32)
+    elongation = np.empty((len(pairs), 12))
+    for cell in range(len(corners)):
+        x, g = corners[cell], gradients[cell]
+        gamma[cell] = (modes - np.dot(np.dot(modes, x), g.T)) / 8
+        remainder = modes.T - np.dot(x, np.dot(g.T, modes.T))
+        remainder = np.dot(remainder, np.linalg.inv(np.dot(gamma[cell], modes.T)))
+        for spring in range(len(pairs)):
+            first, second = pairs[spring, 0], pairs[spring, 1]
+            line = x[second] - x[first]
+            scale = np.sqrt(springs[spring] / (line[0] ** 2 + line[1] ** 2 + line[2] ** 2))
+            for mode in range(4):
+                stretch = scale * (remainder[second, mode] - remainder[first, mode])
+                for axis in range(3):
+                    elongation[spring, 4 * axis + mode] = stretch * line[axis]
+        stiffness[cell] = np.dot(elongation.T, elongation)
+    return gamma, stiffness
 
 
 @compiled
@@ -117,66 +127,75 @@ def _along(a: Array, b: Array) -> float:
 
 @compiled
 def _shear_force(
-    x: Array,
     g: Array,
+    gamma: Array,
+    stiffness: NDArray[Any],
     volume: float,
-    springs: Array,
     nodes: Index,
     displacement: Array,
     u: Array,
-    excess: Array,
+    b: Array,
     force: Array,
-) -> float:
-    """Write K_d u of a cell into `force`; return uᵀ K_d u.
+) -> tuple[float, float]:
+    """Write K_d u of a cell into `force`; return uᵀ K_d u, m³, and the mean dilatation g · u.
 
-    The matrix K_d is not assembled. With G = sum u_i g_iᵀ, the remainders u_i - G x_i of the
-    displacements stretch the springs, which gives the forces t_i. With
-    D = 2 V dev(sym G) - sum t_i x_iᵀ the nodal forces are t_i + D g_i. D is in nine registers.
+    The matrix K_d is not assembled. With G = sum u_i g_iᵀ, D = 2 V dev(sym G) and q = S gamma u,
+    the nodal forces are D g_i + gamma_iᵀ q. The eight values of an axis are adjacent in memory, so
+    that they fill the processor's vector registers. G and D are in nine and six registers.
 
     Args:
-        x: corners, m, shape (3, 8).
         g: mean gradients, 1/m, shape (3, 8).
+        gamma: see `hourglass_shapes`, shape (4, 8).
+        stiffness: S, m, shape (12, 12).
         volume: m³.
-        springs: `spring_families` of the nominal box by pair of corners, m, shape (8, 8).
         nodes: the cell's nodes, shape (8,).
         displacement: m, shape (n, 3).
         u: scratch (3, 8) for displacements relative to the first node, m.
-        excess: scratch (3, 8) for the remainders, m.
+        b: scratch (2, 12) for gamma u, m, and q, m².
         force: K_d u, m², shape (3, 8).
     """
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = _split_displacement(x, g, nodes, displacement, u, excess)
+    first = nodes[0]
     for i in range(8):
-        fx = fy = fz = 0.0
-        for j in range(8):
-            line_x, line_y, line_z = x[0, j] - x[0, i], x[1, j] - x[1, i], x[2, j] - x[2, i]
-            pull = (excess[0, j] - excess[0, i]) * line_x + (excess[1, j] - excess[1, i]) * line_y
-            pull += (excess[2, j] - excess[2, i]) * line_z
-            square = line_x * line_x + line_y * line_y + line_z * line_z
-            pull *= springs[i, j] / max(square, LEAST_DIVISOR)  # the square is 0 where i == j
-            fx, fy, fz = fx - pull * line_x, fy - pull * line_y, fz - pull * line_z
-        force[0, i], force[1, i], force[2, i] = fx, fy, fz
-    mean = 2.0 / 3.0 * (xx + yy + zz)
-    xy, xz, yz = volume * (xy + yx), volume * (xz + zx), volume * (yz + zy)
-    yx, zx, zy = xy, xz, yz
+        node = nodes[i]
+        u[0, i] = displacement[node, 0] - displacement[first, 0]
+        u[1, i] = displacement[node, 1] - displacement[first, 1]
+        u[2, i] = displacement[node, 2] - displacement[first, 2]
+    xx, xy, xz = _along(u[0], g[0]), _along(u[0], g[1]), _along(u[0], g[2])
+    yx, yy, yz = _along(u[1], g[0]), _along(u[1], g[1]), _along(u[1], g[2])
+    zx, zy, zz = _along(u[2], g[0]), _along(u[2], g[1]), _along(u[2], g[2])
+    q = b[1]
+    q[:] = 0.0
+    for axis in range(3):
+        for mode in range(4):
+            b[0, 4 * axis + mode] = _along(u[axis], gamma[mode])
+    for i in range(12):
+        for j in range(12):
+            q[j] += stiffness[i, j] * b[0, i]
+    energy = 0.0
+    for j in range(12):
+        energy += q[j] * b[0, j]
+    dilatation = xx + yy + zz
+    mean = 2.0 / 3.0 * dilatation
     xx, yy, zz = volume * (2 * xx - mean), volume * (2 * yy - mean), volume * (2 * zz - mean)
-    fx, fy, fz = force[0], force[1], force[2]
-    xx, xy, xz = xx - _along(fx, x[0]), xy - _along(fx, x[1]), xz - _along(fx, x[2])
-    yx, yy, yz = yx - _along(fy, x[0]), yy - _along(fy, x[1]), yz - _along(fy, x[2])
-    zx, zy, zz = zx - _along(fz, x[0]), zy - _along(fz, x[1]), zz - _along(fz, x[2])
+    xy, xz, yz = volume * (xy + yx), volume * (xz + zx), volume * (yz + zy)
+    energy += ((xx * xx + yy * yy + zz * zz) / 2 + xy * xy + xz * xz + yz * yz) / volume
     for i in range(8):
-        force[0, i] += xx * g[0, i] + xy * g[1, i] + xz * g[2, i]
-        force[1, i] += yx * g[0, i] + yy * g[1, i] + yz * g[2, i]
-        force[2, i] += zx * g[0, i] + zy * g[1, i] + zz * g[2, i]
-    energy = _along(force[0], u[0]) + _along(force[1], u[1]) + _along(force[2], u[2])
-    return max(energy, 0.0)
+        force[0, i] = xx * g[0, i] + xy * g[1, i] + xz * g[2, i]
+        force[1, i] = xy * g[0, i] + yy * g[1, i] + yz * g[2, i]
+        force[2, i] = xz * g[0, i] + yz * g[1, i] + zz * g[2, i]
+        for mode in range(4):
+            force[0, i] += q[mode] * gamma[mode, i]
+            force[1, i] += q[4 + mode] * gamma[mode, i]
+            force[2, i] += q[8 + mode] * gamma[mode, i]
+    return max(energy, 0.0), dilatation
 
 
 @compiled
 def shear_forces(
-    corners: Array,
     gradients: Array,
+    gammas: Array,
+    stiffness: NDArray[Any],
     volumes: Array,
-    springs: Array,
     nodes: Index,
     chosen: Index,
     displacement: Array,
@@ -184,20 +203,20 @@ def shear_forces(
     """Return K_d u (k, 24) and the equivalent strain (k,), e² = uᵀ K_d u / (3 V), of cells.
 
     Args:
-        corners: m, shape (c, 3, 8).
         gradients: mean gradients, 1/m, shape (c, 3, 8).
+        gammas: see `hourglass_shapes`, shape (c, 4, 8).
+        stiffness: S, m, shape (c, 12, 12).
         volumes: m³, shape (c,).
-        springs: see `_shear_force`.
         nodes: the cells' nodes, shape (c, 8).
         chosen: numbers of the cells, shape (k,).
         displacement: m, shape (n, 3).
     """
     forces, strains = np.empty((len(chosen), 24)), np.empty(len(chosen))
-    u, excess, force = np.empty((3, 8)), np.empty((3, 8)), np.empty((3, 8))
+    u, b, force = np.empty((3, 8)), np.empty((2, 12)), np.empty((3, 8))
     for k in range(len(chosen)):
         cell = chosen[k]
-        x, g, volume = corners[cell], gradients[cell], volumes[cell]
-        energy = _shear_force(x, g, volume, springs, nodes[cell], displacement, u, excess, force)
+        g, volume, shapes = gradients[cell], volumes[cell], (gammas[cell], stiffness[cell])
+        energy, _ = _shear_force(g, *shapes, volume, nodes[cell], displacement, u, b, force)
         strains[k] = np.sqrt(energy / (3 * volume))
         for i in range(8):
             for a in range(3):
@@ -207,10 +226,10 @@ def shear_forces(
 
 @compiled
 def softened_forces(
-    corners: Array,
     gradients: Array,
+    gammas: Array,
+    stiffness: NDArray[Any],
     volumes: Array,
-    springs: Array,
     shear_modulus: float,
     knots: Array,
     cubic: Array,
@@ -230,11 +249,11 @@ def softened_forces(
         cubic: its coefficients, the highest power first, shape (4, q - 1).
         least: smallest e that is distinguished from zero.
     """
-    u, excess, force = np.empty((3, 8)), np.empty((3, 8)), np.empty((3, 8))
+    u, b, force = np.empty((3, 8)), np.empty((2, 12)), np.empty((3, 8))
     for k in range(len(chosen)):
         cell = chosen[k]
-        x, g, volume = corners[cell], gradients[cell], volumes[cell]
-        energy = _shear_force(x, g, volume, springs, nodes[cell], displacement, u, excess, force)
+        g, volume, shapes = gradients[cell], volumes[cell], (gammas[cell], stiffness[cell])
+        energy, _ = _shear_force(g, *shapes, volume, nodes[cell], displacement, u, b, force)
         strain = min(max(np.sqrt(energy / (3 * volume)), least), knots[-1])
         part = min(np.searchsorted(knots, strain, side="right") - 1, len(knots) - 2)
         y = strain - knots[part]
@@ -247,10 +266,10 @@ def softened_forces(
 
 @compiled
 def cell_forces(
-    corners: Array,
     gradients: Array,
+    gammas: Array,
+    stiffness: NDArray[Any],
     volumes: Array,
-    springs: Array,
     shear_modulus: float,
     bulk_modulus: float,
     knots: Array,
@@ -258,7 +277,7 @@ def cell_forces(
     least: float,
     nodes: Index,
     displacement: Array,
-    residuals: Array,
+    sizes: Array,
     internal: Array,
 ) -> float:
     """Return uᵀ K_T u, N·m, and compute the forces of all cells in the same pass.
@@ -268,27 +287,31 @@ def cell_forces(
 
     Args:
         bulk_modulus: K, Pa.
-        residuals: overwritten by (mu - mu_s) K_d u of each cell, N, shape (c, 24). The linear solid
-            carries this force in excess.
+        sizes: overwritten by the norm of (mu - mu_s) K_d u of each cell, N, shape (c,). The linear
+            solid carries this force in excess.
         internal: nodal forces, N, shape (n, 3). mu_s K_d u + K V g (g · u) of the cells is added.
     """
-    u, excess, force = np.empty((3, 8)), np.empty((3, 8)), np.empty((3, 8))
+    u, b, force = np.empty((3, 8)), np.empty((2, 12)), np.empty((3, 8))
     tangent_work = 0.0
     for cell in range(len(nodes)):
-        x, g, volume = corners[cell], gradients[cell], volumes[cell]
-        energy = _shear_force(x, g, volume, springs, nodes[cell], displacement, u, excess, force)
+        g, volume, shapes = gradients[cell], volumes[cell], (gammas[cell], stiffness[cell])
+        energy, dilatation = _shear_force(
+            g, *shapes, volume, nodes[cell], displacement, u, b, force
+        )
         strain = min(max(np.sqrt(energy / (3 * volume)), least), knots[-1])
         part = min(np.searchsorted(knots, strain, side="right") - 1, len(knots) - 2)
         y = strain - knots[part]
         stress = ((cubic[0, part] * y + cubic[1, part]) * y + cubic[2, part]) * y + cubic[3, part]
         secant = stress / (3 * strain)
         slope = (3 * cubic[0, part] * y + 2 * cubic[1, part]) * y + cubic[2, part]
-        dilatation = _along(u[0], g[0]) + _along(u[1], g[1]) + _along(u[2], g[2])
         pressure = bulk_modulus * volume * dilatation
         tangent_work += slope * energy / 3 + pressure * dilatation
+        square = (
+            _along(force[0], force[0]) + _along(force[1], force[1]) + _along(force[2], force[2])
+        )
+        sizes[cell] = (shear_modulus - secant) * np.sqrt(square)
         for i in range(8):
             for a in range(3):
-                residuals[cell, 3 * i + a] = (shear_modulus - secant) * force[a, i]
                 internal[nodes[cell, i], a] += secant * force[a, i] + pressure * g[a, i]
     return tangent_work
 
@@ -420,25 +443,25 @@ class CalibratedNetwork(Solid):
         return forces
 
     def forces(self, displacement: Array) -> tuple[Array, Array, float]:
-        """Return f(u) (n, 3), N, h of each cell (c, 24), N, and uᵀ K_T u, N·m; see `Solid`."""
+        """Return f(u) (n, 3), N, |h| of each cell (c,), N, and uᵀ K_T u, N·m; see `Solid`."""
         if self.curve.spline is None:
             return super().forces(displacement)
         shear, bulk = self.curve.shear_modulus, self.material.bulk_modulus
         knots, cubic = self.curve.spline.x, self.curve.spline.c
-        residuals = np.empty((len(self.cells), 24))
+        sizes = np.empty(len(self.cells))
 
         def forces_and_work(half: slice) -> tuple[Array, float]:
             internal = np.zeros_like(self.nodes)
-            corners, gradients, volume, springs = self._shapes
+            gradients, gammas, stiffness, volumes = self._shapes
             work = cell_forces(
-                corners[half], gradients[half], volume[half], springs,
+                gradients[half], gammas[half], stiffness[half], volumes[half],
                 shear, bulk, knots, cubic, LEAST_STRAIN,
-                self.cells[half], displacement, residuals[half], internal,
+                self.cells[half], displacement, sizes[half], internal,
             )  # fmt: skip
             return internal, work
 
         (first, first_work), (second, second_work) = in_halves(forces_and_work, len(self.cells))
-        return first + second, residuals, first_work + second_work
+        return first + second, sizes, first_work + second_work
 
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
         """Return d f / d u (3n, 3n): mu_s K_d + mu_s'/(3 V e) (K_d u)(K_d u)ᵀ + bulk."""
@@ -455,15 +478,11 @@ class CalibratedNetwork(Solid):
         return self.pattern.assemble(matrices())
 
     @cached_property
-    def _shapes(self) -> tuple[Array, Array, Array, Array]:
-        """Corners (c, 3, 8), mean gradients (c, 3, 8), volumes (c,) and springs (8, 8)."""
-        corners, gradients = (
-            np.ascontiguousarray(values.transpose(0, 2, 1))
-            for values in (self.corners(), self.gradients)
-        )
-        springs = np.zeros((8, 8))
-        springs[tuple(PAIRS.T)] = self.springs
-        return corners, gradients, self.volume, springs + springs.T
+    def _shapes(self) -> tuple[Array, Array, NDArray[Any], Array]:
+        """Mean gradients (c, 3, 8), gamma (c, 4, 8), S (c, 12, 12) and volumes (c,)."""
+        measures = self.corners(), self.gradients, self.springs, PAIRS, HOURGLASS_MODES
+        gradients = np.ascontiguousarray(self.gradients.transpose(0, 2, 1))
+        return gradients, *hourglass_shapes(*measures), self.volume
 
     def _state(self, displacement: Array, chosen: Index | None = None) -> tuple[Array, Array]:
         """Return K_d u (k, 24) and the equivalent strain e (k,) of the chosen cells."""

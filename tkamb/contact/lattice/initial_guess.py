@@ -10,6 +10,13 @@ from tkamb.contact.lattice.settings import LATTICE_SOLVER
 from tkamb.contact.result import Guess, WarmStart
 from tkamb.geometry.frames import Array, Index, Mask
 
+LEVER_ARM = 0.03
+"""m: distance from the femoral axis to the contact. It converts a rotation to a distance."""
+LARGEST_SHARE = 1.0
+"""1: largest share of the last change by which a state is extrapolated. Larger: not studied."""
+LARGEST_TURN = 0.5
+"""1: largest part of a step across the last one, as a share of the step, with an extrapolation."""
+
 
 @dataclass(frozen=True, eq=False)
 class LatticeStart(WarmStart):
@@ -17,12 +24,14 @@ class LatticeStart(WarmStart):
 
     Args:
         problem: the problem that was solved. Other problems ignore the warm start.
-        loads: nonlinear loads h plus the residual r (`nonlinear_balance.py`), N, shape (n, 3), the
-            first h of the next solution; None for a linear material.
+        loads: nonlinear loads h (`nonlinear_balance.py`), N, shape (n, 3), the first h of the next
+            solution; None for a linear material.
         displacement: displacement of the contact nodes, m, shape (c, 3); 0 except at candidates.
         depth: travel of the femoral component since it touched the first contact node, m.
         region: elements outside of which h is zero, or None.
         softening: s, see `Residual`.
+        half: L⁻¹ h in elimination order, or None.
+        before: warm start of the solution that led to this one, without its own `before`; or None.
     """
 
     problem: ContactProblem
@@ -31,6 +40,43 @@ class LatticeStart(WarmStart):
     depth: float
     region: Region | None
     softening: float = 1.0
+    half: Array | None = None
+    before: "LatticeStart | None" = None
+
+    def extrapolated(self, pose: Array) -> "LatticeStart":
+        """Return this state plus its last change, if the step to a pose continues the last step.
+
+        Args:
+            pose: pose_femoral_in_insert, shape (4, 4); its height has no influence.
+        """
+        last = self.before
+        if last is None:
+            return self
+        change, step = step_between(last.pose, self.pose), step_between(self.pose, pose)
+        share = min(float(change @ step) / max(float(change @ change), 1e-300), LARGEST_SHARE)
+        across = np.linalg.norm(step - share * change)
+        if share <= 0 or across > LARGEST_TURN * np.linalg.norm(step):
+            return self
+        both = (self.displacement != 0) & (last.displacement != 0)
+        moved = np.where(both, self.displacement - last.displacement, 0.0)
+        return replace(
+            self,
+            loads=_continued(last.loads, self.loads, share),
+            half=_continued(last.half, self.half, share),
+            displacement=self.displacement + share * moved,
+        )
+
+
+def _continued(last: Array | None, value: Array | None, share: float) -> Array | None:
+    """Return a value plus a share of its last change; None if one of them is unknown."""
+    return None if last is None or value is None else value + share * (value - last)
+
+
+def step_between(start: Array, end: Array) -> Array:
+    """Return the step between two poses without its height, m, shape (12,)."""
+    step = (end - start)[:3] * [LEVER_ARM, LEVER_ARM, LEVER_ARM, 1.0]
+    step[1, 3] = 0.0
+    return np.asarray(step.ravel())
 
 
 def lattice_start(state: LatticeState, start: Guess | None) -> LatticeStart | None:
@@ -55,6 +101,7 @@ class InitialGuess:
         offset: creep displacement of the candidates of a linear material, m, shape (m, 3), or
             None.
         softening: s of an earlier solution, see `Residual`.
+        half: L⁻¹ h of an earlier solution in elimination order, or None.
         region_only: whether the iteration stops by the residual of the region alone.
     """
 
@@ -68,13 +115,20 @@ class InitialGuess:
     region: Region | None = None
     offset: Array | None = None
     softening: float = 1.0
+    half: Array | None = None
     region_only: bool = False
 
     @property
     def cold(self) -> "InitialGuess":
         """The same guess without the state of an earlier solution."""
         return replace(
-            self, loads=None, displacement=None, region=None, softening=1.0, region_only=False
+            self,
+            loads=None,
+            displacement=None,
+            region=None,
+            softening=1.0,
+            half=None,
+            region_only=False,
         )
 
 
@@ -109,7 +163,7 @@ def initial_guess(
         return guess
     return replace(
         guess, loads=start.loads, displacement=start.displacement[nodes], region=start.region,
-        region_only=region_only, softening=start.softening,
+        region_only=region_only, softening=start.softening, half=start.half,
     )  # fmt: skip
 
 

@@ -68,7 +68,7 @@ class CellContact(ContactModel):
 
     Args:
         resolution: edge of the cells, m.
-        tolerance: the three tolerances of `LatticeSolverSettings` are multiplied by
+        tolerance: the four tolerances of `LatticeSolverSettings` are multiplied by
             tolerance / 1e-3. The relative error of the approach is at most half of `tolerance`.
         pressure_rule: "tributary" (a node's force over its tributary area) or "source" (force over
             the mean area of the nodes in contact, Sharma 2008, section 4.5.6).
@@ -94,6 +94,7 @@ class CellContact(ContactModel):
             force_tolerance=scale * defaults.force_tolerance,
             work_tolerance=scale * defaults.work_tolerance,
             gap_tolerance=scale * defaults.gap_tolerance,
+            peak_tolerance=scale * defaults.peak_tolerance,
         )
 
     direction: ClassVar[Direction] = "normal"
@@ -250,7 +251,8 @@ class CellContact(ContactModel):
         approach, m.
         """
         (gaps, planes), settings = gaps_and_planes, self.settings
-        start = lattice_start(state, guess_or_start)
+        before = lattice_start(state, guess_or_start)
+        start = None if before is None else before.extrapolated(pose)
         forces_only = region_only and start is not None and not self.newton
         for _ in range(settings.max_expansions):
             guess = initial_guess(
@@ -271,10 +273,10 @@ class CellContact(ContactModel):
                     result = within_insert(state, result, *flags)
                 if not solution.converged:
                     return _with_start(result)
-                return result, _start_after(state, result, solution, overlap + approach)
+                return result, _start_after(state, result, solution, overlap + approach, before)
             if solution.converged:  # the solution with more candidates begins at this state
                 at_pose = WarmStart(state.pair, pose, state.points, np.zeros(len(gaps)), gaps)
-                start = _start_after(state, at_pose, solution, overlap + approach)
+                start = _start_after(state, at_pose, solution, overlap + approach, None)
             depth = 1.1 * approach
         saturated = "the set of candidate nodes is saturated"
         return _with_start(ContactResult.out_of_range(state, pose, saturated))
@@ -368,19 +370,27 @@ def _with_start(result: ContactResult) -> tuple[ContactResult, WarmStart]:
 
 
 def _start_after(
-    state: LatticeState, contact: Guess, solution: Solution, depth: float
+    state: LatticeState,
+    contact: Guess,
+    solution: Solution,
+    depth: float,
+    before: LatticeStart | None,
 ) -> LatticeStart:
     """Return the warm start of a solution that has converged.
 
     Args:
         contact: pose, pressure and gap of the solution.
         depth: travel of the femoral component since it touched the first contact node, m.
+        before: warm start of this solution.
     """
+    if before is not None:
+        before = replace(before, before=None)
     displacement = np.zeros_like(state.surface.points)
     displacement[solution.candidates] = solution.displacement
     return LatticeStart(
         state.pair, contact.pose, state.points, contact.pressure, contact.gap,
         state.problem, solution.loads, displacement, depth, solution.region, solution.softening,
+        solution.half, before,
     )  # fmt: skip
 
 

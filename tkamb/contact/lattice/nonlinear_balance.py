@@ -25,7 +25,7 @@ from tkamb.contact.lattice.initial_guess import InitialGuess
 from tkamb.contact.lattice.problem import ContactProblem, Region
 from tkamb.contact.lattice.settings import LatticeSolverSettings
 from tkamb.contact.lattice.solid import Solid
-from tkamb.geometry.frames import Array, Mask
+from tkamb.geometry.frames import Array, Index, Mask
 
 
 @dataclass(frozen=True)
@@ -38,33 +38,46 @@ class Residual:
             estimate of the relative error of the approach.
         gap: largest distance of an active node from the femoral surface, or largest penetration
             of another node, relative to the largest displacement of an active node.
+        peak: largest relative growth of the largest nodal force if the residual at the candidates
+            were added: an estimate of the relative error of the peak.
     """
 
     force: float
     work: float = 0.0
     gap: float = 0.0
+    peak: float = 0.0
 
     @classmethod
     def of(
-        cls, r: Array, field: Array, force: Array, displacement: Array, softening: float
+        cls,
+        r: Array,
+        field: Array,
+        force: Array,
+        displacement: Array,
+        candidates: Index,
+        softening: float,
     ) -> "Residual":
-        """Return the force and the work of residual nodal forces.
+        """Return the force, the work and the peak of residual nodal forces.
 
         Args:
             r: f - f_int(u), N, shape (n, 3), zero at held unknowns.
             field: u, m, shape (n, 3).
-            force: contact forces, N, shape (m, 3).
-            displacement: displacement of the loaded nodes, m, shape (m, 3).
+            force: contact forces on the candidates, N, shape (m, 3).
+            displacement: displacement of the candidates, m, shape (m, 3).
+            candidates: their nodes, shape (m,).
             softening: s.
         """
         size = max(float(np.linalg.norm(force)), 1e-300)
         work = abs(float(np.vdot(r, field))) / max(float(np.vdot(force, displacement)), 1e-300)
-        return cls(float(np.linalg.norm(r)) / size, softening * work)
+        nodal, error = (np.linalg.norm(each, axis=1) for each in (force, r[candidates]))
+        peak = float((nodal + error).max() / max(float(nodal.max()), 1e-300)) - 1.0
+        return cls(float(np.linalg.norm(r)) / size, softening * work, peak=peak)
 
     def within(self, settings: LatticeSolverSettings) -> bool:
         """Return whether all residuals are within their tolerances; NaN is not."""
         in_balance = self.force <= settings.force_tolerance and self.work <= settings.work_tolerance
-        return in_balance and self.gap <= settings.gap_tolerance
+        smooth = self.gap <= settings.gap_tolerance and self.peak <= settings.peak_tolerance
+        return in_balance and smooth
 
     @property
     def reported(self) -> float:
@@ -80,7 +93,7 @@ class LinearBalance:
         displacement: total displacement of the candidates, m, shape (m, 3).
     """
 
-    residual, field, loads, region, softening = Residual(0.0), None, None, None, 1.0
+    residual, field, h, half, region, softening = Residual(0.0), None, None, None, None, 1.0
 
     def __init__(self, offset: Array) -> None:
         self.offset = offset
@@ -108,7 +121,9 @@ class NonlinearBalance:
             `measure` from the factor.
         field: displacement of the region's nodes, after `measure` of all nodes, m, shape (n, 3).
         residual: force and work of the region, after `measure` of the whole solid.
-        loads: h + r, N, shape (n, 3); after `measure` usable as warm start.
+        h: nonlinear loads of the last pass, N, shape (n, 3).
+        half: L⁻¹ h in elimination order.
+        loads: h + r, N, shape (n, 3).
         softening: s of the last measurement.
     """
 
@@ -122,19 +137,21 @@ class NonlinearBalance:
         self._rounding = np.zeros((len(guess.candidates), 3))
         self._differences: list[tuple[Array, Array]] = []
         self.softening, self.residual = guess.softening, Residual(np.inf, np.inf)
-        self._set_loads(self._constant if guess.loads is None else guess.loads)
+        if guess.loads is None or guess.half is None:
+            self._set_loads(self._constant if guess.loads is None else guess.loads)
+        else:
+            self.h, self.half = guess.loads, guess.half
 
     def _set_loads(self, h: Array) -> None:
         """Set h (n, 3), N, on the nodes of the region, and 0 elsewhere."""
-        self._h, nodes = np.zeros_like(h), self._region.nodes
-        self._h[nodes] = h[nodes]
-        # L⁻¹ h in elimination order.
-        self._half = self._problem.operator.start(self._h, self._region.fronts)
+        self.h, nodes = np.zeros_like(h), self._region.nodes
+        self.h[nodes] = h[nodes]
+        self.half = self._problem.operator.start(self.h, self._region.fronts)
 
     @property
     def offset(self) -> Array:
         """Displacement (m, 3) of the candidates without contact forces, m."""
-        return self._response.displacement(self._half) + self._rounding
+        return self._response.displacement(self.half) + self._rounding
 
     def displace(self, force: Array, displacement: Array) -> None:
         """Compute the region's displacement and residual under contact forces.
@@ -146,19 +163,19 @@ class NonlinearBalance:
         operator, region, solid = self._problem.operator, self._region, self._problem.solid
         self._force, self.displacement = force, displacement
         # First L⁻¹ (h + f), then K⁻¹ (h + f) in the unknowns of the region's fronts.
-        self._x = self._half.copy()
+        self._x = self.half.copy()
         self._response.push(force, self._x)
         operator.factor.backward(self._x, region.fronts)
         self._measured = False
         if region.whole:
             self.measure()
             return
-        self.field = np.zeros_like(self._h)
+        self.field = np.zeros_like(self.h)
         self.field[region.nodes] = operator.nodal(self._x, region.nodes)
         shares = solid.nonlinear_residual(self.field, region.elements)
         self.loads = self._constant + solid.scatter.sum(shares, region.elements)
-        r = np.zeros_like(self._h)
-        r[region.nodes] = (self.loads - self._h)[region.nodes]
+        r = np.zeros_like(self.h)
+        r[region.nodes] = (self.loads - self.h)[region.nodes]
         self._set_residual(r)
 
     def measure(self) -> None:
@@ -172,10 +189,10 @@ class NonlinearBalance:
             others = np.setdiff1d(fronts, self._region.fronts.fronts, assume_unique=True)
             operator.factor.backward(self._x, operator.factor.shared(others))
         self.field = operator.nodal(self._x)
-        internal, self._shares, self.softening = forces_of(solid, self.field)
+        internal, self._sizes, self.softening = forces_of(solid, self.field)
         r = -internal
         r[self._candidates] += self._force
-        self.loads, self._measured = self._h + r, True
+        self.loads, self._measured = self.h + r, True
         self._set_residual(r)
         # The factor is less precise than the compliance. The difference of their displacements
         # corrects the offset of the next passes.
@@ -188,7 +205,9 @@ class NonlinearBalance:
         for loads in (r, self.loads):
             loads.ravel()[self._problem.held_unknowns] = 0.0
         last, self._size = self.residual, float(np.linalg.norm(self._force))
-        new = Residual.of(r, self.field, self._force, self.displacement, self.softening)
+        new = Residual.of(
+            r, self.field, self._force, self.displacement, self._candidates, self.softening
+        )
         # The work is small by chance where it changes its sign. So it may not fall by a larger
         # factor than the force.
         fall = min(new.force / max(last.force, 1e-300), 1.0) if np.isfinite(last.force) else 0.0
@@ -199,18 +218,18 @@ class NonlinearBalance:
         if self._measured:
             self._choose_region()
         nodes = self._region.nodes
-        h = self._h[nodes].ravel()
+        h = self.h[nodes].ravel()
         step = self.softening * (self.loads[nodes].ravel() - h)
         self._differences.append((h + step, step))
         del self._differences[: -self._settings.anderson_depth - 1]
-        next_loads = np.zeros_like(self._h)
+        next_loads = np.zeros_like(self.h)
         next_loads[nodes] = accelerated(self._differences).reshape(-1, 3)
         self._set_loads(next_loads)
 
     def _choose_region(self) -> None:
         """Choose the region; the loads of the other elements are constant from here on."""
         tolerance = self._settings.force_tolerance * self._size
-        if self._region.whole or self._beyond(self._region, self.loads - self._h) > tolerance:
+        if self._region.whole or self._beyond(self._region, self.loads - self.h) > tolerance:
             region = self.region
             if self._beyond(region, self.loads) > tolerance:
                 region = self._problem.everywhere
@@ -218,7 +237,8 @@ class NonlinearBalance:
                 self._differences = []
             self._region = region
         elements = self._region.elements
-        in_region = self._problem.solid.scatter.sum(self._shares[elements], elements)
+        shares = self._problem.solid.nonlinear_residual(self.field, elements)
+        in_region = self._problem.solid.scatter.sum(shares, elements)
         self._constant = self.loads - in_region
 
     @property
@@ -226,10 +246,9 @@ class NonlinearBalance:
         """The elements with the largest shares of h at the measured displacement."""
         if not self._measured:
             return self._region
-        settings, shares = self._settings, self._shares
+        settings = self._settings
         allowed = settings.region_tolerance * settings.force_tolerance * self._size
-        size = np.sqrt(np.einsum("ij,ij->i", shares, shares))
-        return Region.of(self._problem, np.flatnonzero(largest_shares(size, allowed)))
+        return Region.of(self._problem, np.flatnonzero(largest_shares(self._sizes, allowed)))
 
     def _beyond(self, region: Region, force: Array) -> float:
         """Return the norm of forces (n, 3), N, on the nodes outside of a region."""
@@ -239,13 +258,10 @@ class NonlinearBalance:
 
 
 def forces_of(solid: Solid, field: Array) -> tuple[Array, Array, float]:
-    """Return f_int(u) (n, 3), N, the elements' shares of h (k, 3p), N, and the softening s at u.
-
-    An element has p nodes.
-    """
-    internal, shares, tangent_work = solid.forces(field)
+    """Return f_int(u) (n, 3), N, the norms of the elements' shares of h (k,), N, and s at u."""
+    internal, sizes, tangent_work = solid.forces(field)
     work = float(np.vdot(internal, field))
-    return internal, shares, work / max(tangent_work, 1e-3 * abs(work), 1e-300)
+    return internal, sizes, work / max(tangent_work, 1e-3 * abs(work), 1e-300)
 
 
 def accelerated(iterates: list[tuple[Array, Array]]) -> Array:
@@ -273,8 +289,9 @@ def largest_shares(size: Array, allowed: float) -> Mask:
         size: norm of each element's share of h, N, shape (c,).
         allowed: largest root of the sum of squares of the omitted shares, N.
     """
-    order = np.argsort(size)
-    result = np.zeros(len(size), bool)
-    omitted = np.searchsorted(np.cumsum(size[order] ** 2), allowed**2, side="right")
-    result[order[omitted:]] = True
+    result = size > allowed / np.sqrt(len(size))  # the others are within the bound in any case
+    ordered = np.sort(size[result])
+    sums = np.cumsum(ordered**2) + float(np.square(size[~result]).sum())
+    omitted = np.searchsorted(sums, allowed**2, side="right")
+    result &= size > (ordered[omitted - 1] if omitted else 0.0)
     return result

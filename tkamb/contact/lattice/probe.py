@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.contact.lattice.initial_guess import LatticeStart, lattice_start
+from tkamb.contact.lattice.initial_guess import LatticeStart, lattice_start, step_between
 from tkamb.contact.lattice.problem import ContactProblem, LatticeState
 from tkamb.contact.model import LoadedPoints, Probe, ProbedContact, condyle_wrenches
 from tkamb.contact.result import ContactResult, Guess, WarmStart, medial_points
@@ -34,8 +34,6 @@ the region is evaluated, in half the time. The residual of the whole solid is th
 the tolerance (`tests/test_lattice_probe.py`)."""
 REGION_HOLDS_TO = 1.1
 """1: largest ratio of the contact force to that of the last evaluation of the whole solid."""
-LEVER_ARM = 0.03
-"""m: distance from the femoral axis to the contact. It converts a rotation to a distance."""
 
 
 class LatticeProbe(Probe):
@@ -63,8 +61,8 @@ class LatticeProbe(Probe):
         """
         model = self._lattice_model
         if self._measured is not None:
-            step = (pose - self._measured[0])[:3] * [LEVER_ARM, LEVER_ARM, LEVER_ARM, 1.0]
-            step[1, 3] = 0.0  # the limit on the forces covers a change of height
+            # The step has no height: the limit on the forces covers its change.
+            step = step_between(self._measured[0], pose)
             if np.linalg.norm(step) <= REGION_HOLDS_WITHIN * self._state.lattice.spacing.min():
                 result, start = model.evaluate_from(self._state, pose, self.start, True)
                 if np.linalg.norm(result.nodal_force) <= REGION_HOLDS_TO * self._measured[1]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 class LatticeSolverSettings:
     """When the contact iteration stops, and which elements and nodes it evaluates.
 
-    A contact model's option `tolerance` multiplies the first three fields by `tolerance`/1e-3.
+    A contact model's option `tolerance` multiplies the first four fields by `tolerance`/1e-3.
     """
 
     force_tolerance: float = 2e-3
@@ -29,6 +29,10 @@ class LatticeSolverSettings:
     node, relative to the largest displacement of an active node. Smaller: more passes where the
     femoral normal turns quickly. Larger: fewer passes, peaks less accurate there. Measured: the
     error of a peak at a rim is up to three times the gap."""
+    peak_tolerance: float = 1e-3
+    """1: largest relative growth of the largest nodal force if the residual forces were added to
+    the contact forces. It estimates the relative error of the peak pressure. Smaller: more passes.
+    Larger: fewer passes, peaks less accurate. Measured: the error of a peak is about this value."""
     max_passes: int = 40
     """Largest number of passes, and of steps of the full Newton iteration. Knees take 1 to 8
     passes. Smaller: slow presses need the full Newton iteration, or do not converge. Larger: more

@@ -270,7 +270,7 @@ class Solid(ABC):
         They do not use the stored factor. So its rounding does not hide the error of a solution.
 
         Returns:
-            Internal forces f(u) (n, 3), N; h = K u - f(u) of each element (k, 3p), N; and
+            Internal forces f(u) (n, 3), N; norm of h = K u - f(u) of each element (k,), N; and
             uᵀ K_T u, N·m, with the tangent stiffness K_T (here by a finite difference).
         """
         residuals = self.nonlinear_residual(displacement)
@@ -279,7 +279,7 @@ class Solid(ABC):
         scaled = (1 + DIFFERENCE) * displacement
         scaled_force = self.linear_force(scaled) - self.residual_force(scaled)
         work = float(np.vdot(displacement, scaled_force - internal)) / DIFFERENCE
-        return internal, residuals, work
+        return internal, np.linalg.norm(residuals, axis=1), work
 
     def residual_force(self, displacement: Array) -> Array:
         """Return h = K u - f(u), N, (n, 3): linear minus internal forces."""

@@ -25,6 +25,7 @@ K, and the gap with new rays at the displaced nodes. The iteration has converged
     |r| / |f| <= force_tolerance
     s |r · u| / (f · u) <= work_tolerance,    s = (f_int(u) · u) / (uᵀ K_T u)
     |gamma| / max |u| <= gap_tolerance        for active nodes, and for penetrations of others
+    max(|f_i| + |r_i|) / max |f_i| - 1 <= peak_tolerance
 
 and the active set has stopped changing. The result reports these residuals. The second residual
 estimates the relative error of the approach, because an error du = e u leaves r = e K_T u. The load
@@ -66,10 +67,11 @@ class Solution:
         planes: femoral points and normals of the candidates.
         displacement: displacement of the candidates, m, shape (m, 3).
         field: displacement of all nodes, m, shape (n, 3); None for a linear material.
-        loads: h + r, N, shape (n, 3), for a warm start; None for a linear material.
+        loads: h, N, shape (n, 3), for a warm start; None for a linear material.
         residual: residual of the whole solid.
         region: region for a warm start, or None.
         softening: s for a warm start.
+        half: L⁻¹ h in elimination order for a warm start, or None.
     """
 
     candidates: Index
@@ -82,6 +84,7 @@ class Solution:
     residual: Residual
     region: Region | None = None
     softening: float = 1.0
+    half: Array | None = None
 
     @property
     def converged(self) -> bool:
@@ -138,7 +141,7 @@ def solve(
                 forces = replace(forces, converged=within and forces.converged)
                 return Solution(
                     guess.candidates, forces, planes, balance.displacement, balance.field,
-                    balance.loads, passes, residual, balance.region, balance.softening,
+                    balance.h, passes, residual, balance.region, balance.softening, balance.half,
                 )  # fmt: skip
         balance.advance()
 
@@ -265,16 +268,16 @@ def solve_by_newton(
         u_full, forces = _step(problem, nodes, points, u, planes, load, active)
         u, active = u + step * (u_full - u), forces.active
         gap, force = sliding.follow(u[nodes], forces), forces.force[:, None] * planes.normals
-        internal, shares, softening = forces_of(solid, u)
+        internal, _, softening = forces_of(solid, u)
         r = -internal
         r[nodes] += force
-        residual = replace(Residual.of(free * r, u, force, u[nodes], softening), gap=gap)
+        residual = replace(Residual.of(free * r, u, force, u[nodes], nodes, softening), gap=gap)
         if not np.isfinite(residual.force):
             raise ComputationError("Newton's iteration diverged: its forces are not finite")
         within = residual.within(settings)
         step, last_force = 0.5 if residual.force > 2 * last_force else 1.0, residual.force
     forces = replace(forces, converged=within and forces.converged)
-    h = free * solid.scatter.sum(shares)
+    h = free * solid.residual_force(u)
     return Solution(guess.candidates, forces, planes, u[nodes], u, h, steps, residual)
 
 
@@ -290,7 +293,7 @@ def _step(
     """Return the displacement (n, 3), m, and the contact forces of one full Newton step."""
     solid = problem.solid
     operator = prepare_operator(solid.tangent(u), problem.index, problem.held, nodes)
-    without_contact = u - operator.solve(solid.internal_force(u))
+    without_contact = u - operator.solve(solid.forces(u)[0])
     response = ContactResponse.of(operator.half)
     forces, _ = solve_pass(response, without_contact[nodes], points, planes, load, active)
     contact_force = np.zeros_like(u)
