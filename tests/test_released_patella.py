@@ -354,3 +354,59 @@ def test_check_asks_about_unlikely_lines_of_the_patella(tmp_path, changes, words
         texts.append(" ".join(question.text for question in questions))
     assert not re.search(words, texts[0])
     assert re.search(words, texts[1]), texts[1]
+
+
+def test_the_viewer_draws_the_released_patella(scene, tmp_path):
+    from tkamb.geometry.frames import transform
+    from tkamb.show.view.draw import draw
+    from tkamb.show.view.payload import pack
+    from tkamb.show.view.run import run_of_results
+
+    results = tkamb.simulate(scene, frames=FRAMES, directory=tmp_path)
+    run = run_of_results(tkamb.read_results(tmp_path))
+    drawing = draw(run)
+    frames = range(*FRAMES.indices(101))
+    found = [run.recording.loads(k).geometry.extensor.released.found for k in frames]
+    solids = {one.name: one for one in drawing.solids}
+    poses = np.array([one.poses["patella"] for one in found])
+    # The femur is drawn at its press, and the patella with it.
+    drawn = np.linalg.inv(solids["femoral component"].poses) @ solids["patella"].poses
+    on_femur = np.linalg.inv([one.poses["femur"] for one in found]) @ poses
+    assert drawn == pytest.approx(on_femur, abs=1e-8)
+    assert drawing.button_map.pressure.max(axis=1) == pytest.approx(
+        results["button_peak_pressure_MPa"], rel=1e-9
+    )
+    # The pressed points lie at the femoral component.
+    femoral = solids["femoral component"]
+    for k in range(len(found)):
+        pressed = drawing.button_map.pressure[k] > 0.0
+        points = transform(drawing.button_map.poses[k], drawing.button_map.points[pressed])
+        on_femur = transform(np.linalg.inv(femoral.poses[k]), points)
+        assert femoral.surface.nearest.at(on_femur).distance.max() < 1.5e-3
+    strands = {one.name: one for one in drawing.strands}
+    for one in RELEASED["ligament"]:
+        ends = strands[one["name"].replace("_", " ")].points
+        at = [
+            transform(pose, 1e-3 * np.array(one[end]["point_mm"]))
+            for pose in poses
+            for end in ("proximal", "distal")
+            if one[end]["link"] == "patella"
+        ]
+        gap = np.linalg.norm(ends - np.array(at)[:, None], axis=2).min(axis=1)
+        assert gap == pytest.approx(0.0, abs=1e-4)
+    heads = [strands[one["name"].replace("_", " ")] for one in RELEASED["head"]]
+    assert all(np.isfinite(one.points).all() for one in heads)
+    assert "· patella, lateral tilt" in {row.name for row in drawing.readings}
+    assert len(pack([drawing])) > 1000
+
+
+def test_maps_of_the_button_for_paraview(scene, tmp_path, capsys):
+    from tkamb.cli import main
+    from tkamb.io.recordings.polygon_files import read_vtp_values
+
+    out, vtk = tmp_path / "out", tmp_path / "vtk"
+    results = tkamb.simulate(scene, frames=slice(40, 61, 20), directory=out)
+    assert main(["export", str(out), "--vtp", "--out", str(vtk)]) == 0
+    assert "button.pvd: 2 of 2 frames" in capsys.readouterr().out
+    pressure = read_vtp_values(vtk / "button_0001.vtp", "pressure_Pa")
+    assert 1e-6 * pressure.max() == pytest.approx(results["button_peak_pressure_MPa"][1], rel=1e-9)

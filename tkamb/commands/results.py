@@ -164,17 +164,23 @@ def _export_storage(options: argparse.Namespace) -> int:
 def _export_maps(options: argparse.Namespace) -> int:
     from tkamb.io.claim import claimed_directory
     from tkamb.io.mesh_files import write_map_series
+    from tkamb.run.metrics import map_rows
     from tkamb.run.results_folder import read_results
 
     results = read_results(options.folder)
     if results.maps is None:
         raise InputError("holds no contact.h5", options.folder, "run the scene with [contact]")
     with claimed_directory(options.out, options.force) as folder:
-        names = write_map_series(results.maps, folder)
+        names, buttons = write_map_series(results.maps, folder), list[str]()
+        if results.button_maps is not None and map_rows(results, results.button_maps):
+            buttons = write_map_series(results.button_maps, folder, "button")
     remarks = "; a left knee's mirror image" if results.summary.get("side") == "left" else ""
     remarks += "; without the post's pressure" if "post_force_N" in results.columns else ""
     frames = f"{len(names) - 1} of {len(results)} frames"
     print(f"{options.out / names[0]}: {frames}, m and Pa in the insert frame{remarks}")
+    if buttons:
+        frames = f"{len(buttons) - 1} of {len(results)} frames"
+        print(f"{options.out / buttons[0]}: {frames}, m and Pa in the button's frame")
     return 0
 
 

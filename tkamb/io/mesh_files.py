@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from tkamb.run.maps import ContactMaps
 
 
-SERIES_NAME = "contact.pvd"
 HEXAHEDRON = 12
 """VTK's number for a cell of eight nodes."""
 TYPES = {"f8": "Float64", "i8": "Int64", "u1": "UInt8", "i1": "Int8"}
@@ -82,10 +81,15 @@ def write_triangles(
     _write(root, path)
 
 
-def write_map_series(maps: "ContactMaps", folder: Path) -> list[str]:
+def write_map_series(maps: "ContactMaps", folder: Path, stem: str = "contact") -> list[str]:
     """Write the maps of a run for ParaView: a .vtp for each frame, and a .pvd with all times.
 
     A failed frame has no map (NaN) and gets no file.
+
+    Args:
+        maps: maps of the insert or of the button.
+        folder: folder of the files.
+        stem: beginning of the files' names.
 
     Returns:
         The names of the files, the .pvd first.
@@ -96,11 +100,12 @@ def write_map_series(maps: "ContactMaps", folder: Path) -> list[str]:
     root = Element("VTKFile", type="Collection", version="1.0", byte_order="LittleEndian")
     collection, names = SubElement(root, "Collection"), []
     for k in map(int, mapped_frames):
-        names.append(f"contact_{k:04d}.vtp")
+        names.append(f"{stem}_{k:04d}.vtp")
         write_triangles(folder / names[-1], maps.points_m, maps.triangles, maps.frame_data(k))
         SubElement(collection, "DataSet", timestep=repr(float(maps.time_s[k])), file=names[-1])
-    _write(root, folder / SERIES_NAME)
-    return [SERIES_NAME, *names]
+    series = f"{stem}.pvd"
+    _write(root, folder / series)
+    return [series, *names]
 
 
 def _document(kind: str, points: Array, **counts: int) -> tuple[Element, Element]:

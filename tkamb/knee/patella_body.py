@@ -25,7 +25,7 @@ residual to rounding errors, as far as the force does not jump from facet to fac
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -209,6 +209,20 @@ class PatellaBody:
         place = self.femur_in_button(coordinates)
         heads = (head.loads(place, insertion)[0] for head, insertion in self._heads)
         return sum(heads, self.bundles.wrench(place))
+
+    def head_paths(self, coordinates: Array) -> dict[str, TautPath]:
+        """Return head -> its path to the patella, in the insert frame.
+
+        Raises:
+            ComputationError: an end of a head lies inside the outline.
+        """
+        femur = self.poses["femur"]
+        back = inverse(femur) @ self.patella(coordinates)
+        paths = {one.name: one.path(transform(back, one.insertion)) for one in self.heads}
+        return {
+            name: replace(path, points=transform(femur, path.points))
+            for name, path in paths.items()
+        }
 
     def head_forces(self, coordinates: Array) -> tuple[Array, Array]:
         """Return insertions (h, 3), m, and forces (h, 3), N, of the heads on the patella.

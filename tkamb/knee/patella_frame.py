@@ -15,7 +15,7 @@ patella, up to 5 N.
 
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -45,6 +45,7 @@ from tkamb.knee.patella_body import (
 )
 from tkamb.knee.released_forces import StrandLines
 from tkamb.knee.unknowns import Unknown
+from tkamb.knee.wrapping import TautPath
 
 if TYPE_CHECKING:
     from tkamb.contact.model import Probe
@@ -94,9 +95,10 @@ class PatellaLoads:
         lines: loads of the ligaments from patella to tibia on the links, N.
         straight: ends on patella and tibia of those that do not wrap, insert frame, shape
             (2, k, 3), m, and their tensions, shape (k,), N.
-        heads: loads of the heads of the quadriceps on the patella, N.
         tensions: head -> tension, N.
         found: the patella in equilibrium; None: in an iteration of the search.
+        heads: loads of the heads of the quadriceps on the patella, N; None: as `found`.
+        paths: head -> its path to the patella, insert frame; empty: as `found`.
     """
 
     tension: float
@@ -107,9 +109,10 @@ class PatellaLoads:
     coordinates: Array
     lines: tuple[PointForces, ...]
     straight: tuple[Array, Array]
-    heads: PointForces
     tensions: dict[str, float]
     found: FoundPatella | None = None
+    heads: PointForces | None = None
+    paths: dict[str, TautPath] = field(default_factory=dict)
 
     def plane_of(self, geometry: KneeGeometry) -> KneeGeometry:
         """Return a geometry with the plane patella instead of this one."""
@@ -157,7 +160,7 @@ class PatellaMethod:
     released: tuple[str, ...]
 
     @cached_property
-    def _carried(self) -> tuple[Ligament, ...]:
+    def carried(self) -> tuple[Ligament, ...]:
         """The lines with all points on femur, tibia and patella."""
         placed = {}
         for link in {link for line in self.lines for link in line.links}:
@@ -196,7 +199,7 @@ class PatellaMethod:
             for head in self.heads
         ]
         probe, joint = probe or self.button.contact.probe(), self.chain.patella_joint_in_femur
-        return PatellaBody(self.button, probe, joint, heads, self._carried, poses)
+        return PatellaBody(self.button, probe, joint, heads, self.carried, poses)
 
     def solved(
         self, geometry: KneeGeometry, solve: Solve, start: Array | None = None
@@ -383,7 +386,6 @@ class PatellaMethod:
             balance.coordinates,
             lines,
             (np.array(ends).reshape(2, -1, 3), pulls[straight]),
-            PointForces("patella", *body.head_forces(balance.coordinates)),
             {head.name: head.tension for head in body.heads},
         )
         (muscle,) = plane.muscles
@@ -431,7 +433,9 @@ class PatellaMethod:
             flags = (*flags, words)
         press = replace(found.press, seconds=clock.perf_counter() - began)
         found = replace(found, press=press, flags=flags)
-        released = replace(extensor.released, found=found)
+        heads = PointForces("patella", *body.head_forces(balance.coordinates))
+        paths = body.head_paths(balance.coordinates)
+        released = replace(extensor.released, found=found, heads=heads, paths=paths)
         extensor = replace(extensor, contact_point=press.centre, released=released)
         return replace(geometry, extensor=extensor)
 

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tkamb.geometry.frames import SIDES, Array, Mask
+from tkamb.geometry.frames import SIDES, Array, Mask, inverse
 from tkamb.io.scene.case import Case
+from tkamb.knee.chain import ChainState
 from tkamb.run.claims import split_of
 from tkamb.run.metrics import body_weight, map_rows, medial_share
 from tkamb.show.axis import HorizontalAxis, horizontal_axis
@@ -24,10 +25,17 @@ from tkamb.show.view.lines import (
     path_strands,
 )
 from tkamb.show.view.run import CaseResults, Progress
-from tkamb.show.view.solids import floor_and_foot, solids, worn_insert
+from tkamb.show.view.solids import (
+    contact_poses,
+    floor_and_foot,
+    patella_solids,
+    solids,
+    worn_insert,
+)
 from tkamb.units import MEGAPASCAL, MILLIMETRE
 
 if TYPE_CHECKING:
+    from tkamb.run.maps import ContactMaps
     from tkamb.run.results import Results
 
 STAND_INS = "{} plain stand-ins between the joint centres; they carry no load."
@@ -48,12 +56,14 @@ def draw(
     states = [one.state for one in geometries]
     maps, result = results.maps, map_rows(results)
     rows = [result.get(k, -1) for k in range(len(results))]
+    button = button_poses(run, states, rows)
     contact = case.scene.contact
     floor, centre = floor_and_foot(case, geometries, run.frames)
     others = floor + worn_insert(results, case.scene.patient.side)
     bundles, limit = ligament_strands(recording, states, results)
     muscles, most_active = muscle_strands(geometries)
-    strands = [*bundles, *extensor_strands(recording, states, results), *muscles]
+    extensor = extensor_strands(recording, geometries, results)
+    strands = [*bundles, *extensor, *muscles]
     markers = [*contact_markers(geometries), *centre]
     if maps is not None and result:
         assert case.insert is not None
@@ -70,11 +80,14 @@ def draw(
         times=results["time_s"],
         statuses=tuple(results.status),
         readings=readings(results, axis),
-        solids=solids(case, recording.poses[list(run.frames)], states, maps, rows) + others,
+        solids=solids(case, recording.poses[list(run.frames)], states, maps, rows)
+        + patella_solids(case, _patella_poses(run, states, button))
+        + others,
         strands=tuple(strands),
         arrows=force_arrows(results, geometries, contact.friction if contact else 0.0),
         markers=tuple(markers),
-        map=_pressure_map(results, rows),
+        map=_pressure_map(maps, rows),
+        button_map=_button_map(results, button),
         strain_limit=limit,
         activation_limit=most_active,
         lattice=lattice_lines(case) if lattice else np.empty((0, 2, 3)),
@@ -94,8 +107,46 @@ def _title(run: CaseResults) -> str:
     return f"{name}, contact: {contact.model} at {contact.resolution_mm:g} mm"
 
 
-def _pressure_map(results: "Results", rows: list[int]) -> PressureMap | None:
-    maps = results.maps
+def button_poses(run: CaseResults, states: Sequence[ChainState], rows: Sequence[int]) -> Array:
+    """Return the pose (f, 4, 4) of the patellar button in its contact, in the insert frame.
+
+    It is NaN in a frame without a map of the button.
+
+    Args:
+        states: state of the chain in each frame.
+        rows: row of the insert's map of each frame; -1: the frame has no map.
+    """
+    results = run.results
+    maps, poses = results.button_maps, np.full((len(states), 4, 4), np.nan)
+    femur = contact_poses(np.stack([one.pose("femur") for one in states]), results.maps, rows)
+    if maps is not None:
+        for frame, row in map_rows(results, maps).items():
+            poses[frame] = femur[frame] @ inverse(maps.femoral_pose[row])
+    return poses
+
+
+def _patella_poses(run: CaseResults, states: Sequence[ChainState], button: Array) -> Array:
+    """Return the pose (f, 4, 4) of the patella: that of its contact, or of the equations."""
+    poses = np.stack([state.pose("patella") for state in states]) if _has_patella(run) else button
+    contact, known = run.recording.knee.button_contact, np.isfinite(button).all(axis=(1, 2))
+    if contact is not None:
+        poses[known] = button[known] @ inverse(contact.in_patella)
+    return poses
+
+
+def _has_patella(run: CaseResults) -> bool:
+    return run.case.scene.patella is not None and run.case.patella is not None
+
+
+def _button_map(results: "Results", poses: Array) -> PressureMap | None:
+    maps, rows = results.button_maps, map_rows(results, results.button_maps)
+    if maps is None or not rows:
+        return None
+    found = _pressure_map(maps, [rows.get(k, -1) for k in range(len(results))])
+    return None if found is None else replace(found, poses=poses)
+
+
+def _pressure_map(maps: "ContactMaps | None", rows: list[int]) -> PressureMap | None:
     if maps is None or all(row < 0 for row in rows):
         return None
     missing = np.full(len(maps.points_m), np.nan)
@@ -155,10 +206,26 @@ def readings(results: "Results", axis: HorizontalAxis) -> tuple[Reading, ...]:
         force("quadriceps", results["quadriceps_N"]),
         force("patellar ligament", results["patellar_ligament_N"]),
         force("patellofemoral", results["patellofemoral_N"]),
+        *_button_readings(results, number),
         force("hip", _magnitude(results, "hip_force")),
         force("ground reaction", _magnitude(results, "ground_reaction")),
     ]
     return tuple(row for row in rows if any(value != "–" for value in row.values))
+
+
+def _button_readings(results: "Results", number: Callable[..., Reading]) -> list[Reading]:
+    """Return the numbers of button and released patella that the run has."""
+    rows = (
+        ("· button, peak pressure", "button_peak_pressure_MPa", " MPa", 1),
+        ("· button, contact area", "button_area_mm2", " mm²", 0),
+        ("· patella, lateral tilt", "patella_tilt_deg", "°", 1),
+        ("· patella, lateral shift", "patella_shift_mm", " mm", 1),
+    )
+    return [
+        number(name, results[column], unit, digits)
+        for name, column, unit, digits in rows
+        if column in results.columns
+    ]
 
 
 def _split_readings(

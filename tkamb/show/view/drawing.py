@@ -186,7 +186,7 @@ class Marker:
 
 @dataclass(frozen=True, eq=False)
 class PressureMap:
-    """Pressure over the insert.
+    """Pressure over the insert or the patellar button.
 
     Args:
         points: points of the map, m, shape (n, 3).
@@ -194,12 +194,14 @@ class PressureMap:
         pressure: pressure, MPa, shape (f, n); NaN in a failed frame.
         gap: gap, m, shape (f, n), positive when apart. It locates the edge of the contact between
             the points.
+        poses: pose of the points in the insert frame, shape (f, 4, 4); None: they are in it.
     """
 
     points: Array
     triangles: NDArray[np.int64]
     pressure: Array
     gap: Array
+    poses: Array | None = None
 
     @property
     def peak(self) -> float:
@@ -233,6 +235,7 @@ class Drawing:
         readings: displayed numbers of every frame.
         markers: contact points and centres of pressure.
         map: pressure map; None without contact.
+        button_map: pressure map of the patellar button; None: its contact is not modelled.
         strain_limit: upper end of the ligaments' colour scale; 0 without ligaments.
         activation_limit: upper end of the muscles' colour scale; 0 without muscles.
         lattice: edges of the lattice's cells, m, shape (s, 2, 3); empty unless requested.
@@ -255,6 +258,7 @@ class Drawing:
     activation_limit: float = 0.0
     lattice: Array = field(default_factory=lambda: np.empty((0, 2, 3)))
     notes: tuple[str, ...] = ()
+    button_map: PressureMap | None = None
 
     def __len__(self) -> int:
         return len(self.labels)

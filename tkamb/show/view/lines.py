@@ -33,6 +33,7 @@ from tkamb.show.view.drawing import (
 from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:
+    from tkamb.knee.patella_frame import PatellaMethod
     from tkamb.run.results import Results
 
 NOTHING = np.full(3, np.nan)
@@ -140,6 +141,7 @@ def _distal_end(geometry: KneeGeometry, name: str) -> tuple[Array, Array]:
         return NOTHING, NOTHING
     released = geometry.extensor.released
     if released is not None:
+        assert released.heads is not None
         on_tibia = next(load for load in released.lines if load.link == "tibia")
         return _resultant(released.heads if name == "quadriceps" else on_tibia)
     (muscle,) = geometry.muscles
@@ -241,15 +243,17 @@ def ligament_strands(
 
 
 def extensor_strands(
-    recording: Recording, states: Sequence[ChainState], results: "Results"
+    recording: Recording, geometries: Sequence[KneeGeometry], results: "Results"
 ) -> tuple[Strand, ...]:
     """Return muscle and patellar ligament. Their parts on the bone have another colour.
 
-    A strand with less than `slack_force` is grey.
+    A strand with less than `slack_force` is grey. A released patella has its heads and ligaments.
     """
-    extensor = recording.extensor
+    extensor, states = recording.extensor, [one.state for one in geometries]
     if extensor is None:
         return ()
+    if recording.knee.patella is not None:
+        return _released_strands(recording.knee.patella, geometries)
     paths: list[tuple[TautPath | None, ...]] = []
     for state in states:
         try:
@@ -263,6 +267,31 @@ def extensor_strands(
         _tendon(name, muscle, slack[0]),
         _tendon("patellar ligament", ligament, slack[1]),
     )
+
+
+def _released_strands(
+    method: "PatellaMethod", geometries: Sequence[KneeGeometry]
+) -> tuple[Strand, ...]:
+    """Return heads and ligaments of a released patella; hidden where it was not found."""
+    loads = [one.extensor.released if one.extensor else None for one in geometries]
+    result = []
+    for head in method.heads:
+        paths = [one.paths[head.name] if one and one.found else None for one in loads]
+        result.append(_tendon(head.name.replace("_", " "), paths, np.zeros(len(loads), bool)))
+    lost = dict.fromkeys(("femur", "tibia", "patella"), np.full((4, 4), np.nan))
+    found = [one.found if one else None for one in loads]
+    poses = {
+        link: np.stack([each.poses[link] if each else lost[link] for each in found])
+        for link in lost
+    }
+    for bundle in method.carried:
+        points = bundle.points(poses)
+        pulls = np.array([each.tensions[bundle.name] if each else 0.0 for each in found])
+        colours = np.broadcast_to(rgb(TENDON), points.shape).copy()
+        colours[pulls < SLACK_FORCE] = rgb(SLACK)
+        name = bundle.name.replace("_", " ")
+        result.append(Strand(name, "extensor lines", points, colours, 0.5 * TENDON_RADIUS))
+    return tuple(result)
 
 
 def muscle_strands(geometries: Sequence[KneeGeometry]) -> tuple[tuple[Strand, ...], float]:

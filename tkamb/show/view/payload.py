@@ -192,7 +192,8 @@ def pack(drawings: Sequence[Drawing]) -> bytes:
 
 def peak_pressure(drawings: Sequence[Drawing]) -> float:
     """Return the largest pressure (MPa) of all frames: the top of the common scale."""
-    return max((one.map.peak for one in drawings if one.map), default=0.0)
+    maps = [each for one in drawings for each in (one.map, one.button_map) if each]
+    return max((one.peak for one in maps), default=0.0)
 
 
 def packed_map(pressure_map: PressureMap, peak: float, words: str) -> bytes:
@@ -229,6 +230,10 @@ def _view(
         if len(solid.poses) > 1:
             poses = block.put(np.swapaxes(solid.poses, 1, 2), "float32")
             moving.append({"path": path, "poses": poses})
+    button, path = drawing.button_map, _node_name(root, "pressure map", "button")
+    if button is not None and button.poses is not None:
+        poses = block.put(np.swapaxes(button.poses, 1, 2), "float32")
+        moving.append({"path": path, "poses": poses})
     return {
         "title": drawing.title,
         "side": drawing.side,
@@ -245,6 +250,7 @@ def _view(
         "arrows": [_arrow(block, root, one) for one in drawing.arrows],
         "markers": [_marker(block, root, one) for one in drawing.markers],
         "map": _map(block, drawing.map, peak) if drawing.map else None,
+        "button_map": _map(block, button, peak) if button else None,
         "lattice": block.put(drawing.lattice, "float32") if len(drawing.lattice) else None,
     }
 

@@ -94,7 +94,7 @@ def solids(
     if case.post is not None:
         result.append(Solid("post", "insert", case.post, INSERT, 1.0, still))
     if case.femoral is not None:
-        poses = _contact_poses(solved, maps, rows)
+        poses = contact_poses(solved, maps, rows)
         result.append(
             Solid("femoral component", "femoral component", case.femoral, METAL, 0.5, poses)
         )
@@ -109,12 +109,15 @@ def solids(
             )
         )
     result += [_femur(case, states, solved), _tibia(states)]
-    if case.scene.patella is not None and case.patella is not None:
-        poses = np.stack([state.pose("patella") for state in states])
-        result.append(Solid("patellar button", "patella", case.patella, BUTTON, 1.0, poses))
-        bone = _patella(case)
-        result.append(Solid("patella", "patella", bone, BONE, 0.55, poses))
     return tuple(result)
+
+
+def patella_solids(case: Case, poses: Array) -> tuple[Solid, ...]:
+    """Return patella and button at poses (f, 4, 4) in the insert frame; () without a patella."""
+    if case.scene.patella is None or case.patella is None:
+        return ()
+    button = Solid("patellar button", "patella", case.patella, BUTTON, 1.0, poses)
+    return (button, Solid("patella", "patella", _patella(case), BONE, 0.55, poses))
 
 
 def worn_insert(results: "Results", side: str) -> tuple[Solid, ...]:
@@ -139,7 +142,14 @@ def worn_insert(results: "Results", side: str) -> tuple[Solid, ...]:
     return (Solid(surface.name, "worn insert", surface, INSERT, 1.0, np.eye(4)[None], depth),)
 
 
-def _contact_poses(without_map: Array, maps: ContactMaps | None, rows: Sequence[int]) -> Array:
+def contact_poses(without_map: Array, maps: ContactMaps | None, rows: Sequence[int]) -> Array:
+    """Return the pose (f, 4, 4) of the femoral component in its contact, else that without a map.
+
+    Args:
+        without_map: pose_femur_in_insert of the equations, shape (f, 4, 4).
+        maps: pressure maps of the run; None: there are none.
+        rows: row of the map of each frame; -1: the frame has no map.
+    """
     poses = without_map.copy()
     if maps is not None:
         stored = maps.femoral_pose

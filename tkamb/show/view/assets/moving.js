@@ -172,9 +172,11 @@ function placeMarker(marker, k) {
 
 // A point's level is its share of the largest pressure, negative where nothing presses.
 tkamb.colourMap = function (view, k) {
-  const map = view.map;
-  if (!map) return;
-  const {level} = map.geometry.attributes, start = map === view.runMap ? k * map.count : 0;
-  for (let i = 0; i < map.count; i++) level.array[i] = map.levels[start + i] / 32767;
-  level.needsUpdate = true;
+  for (const map of [view.map, view.button_map]) {
+    if (!map) continue;
+    const {level} = map.geometry.attributes, ofRun = map === view.runMap || map === view.button_map;
+    const start = ofRun ? k * map.count : 0;
+    for (let i = 0; i < map.count; i++) level.array[i] = map.levels[start + i] / 32767;
+    level.needsUpdate = true;
+  }
 };

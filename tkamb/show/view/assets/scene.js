@@ -73,6 +73,10 @@ function buildView(viewer, view, number) {
   for (const marker of view.markers) addMarker(viewer, marker);
   view.runMap = view.map;
   tkamb.showMap(view, view.map);
+  if (view.button_map) {
+    const path = `${view.root}/pressure map/button`;
+    tkamb.viewer.set_object(tkamb.split(path), mapMesh(mapGeometry(view.button_map)));
+  }
   if (view.lattice) tkamb.addLattice(view);
   if (view.map) addSideNames(viewer, view);
   return view;
@@ -167,10 +171,21 @@ function scaleTexture(colours) {
 
 // The map: a level per point (0 to 1), coloured in the fragment as the colour bar says. Where
 // nothing presses the level is negative, and the fragment is cut off. It is drawn 0.1 mm above the
-// insert, whose drawn surface is that close to the true one.
+// insert or the button, whose drawn surface is that close to the true one.
 tkamb.showMap = function (view, map) {
   view.map = map;
   if (!map) return;
+  mapGeometry(map);
+  if (view.mapMesh) {  // a new material would be compiled again
+    view.mapMesh.geometry.dispose();
+    view.mapMesh.geometry = map.geometry;
+    return;
+  }
+  view.mapMesh = mapMesh(map.geometry);
+  tkamb.viewer.set_object(tkamb.split(`${view.root}/pressure map/map`), view.mapMesh);
+};
+
+function mapGeometry(map) {
   const {THREE} = MeshCat;
   if (!map.geometry) {
     map.geometry = new THREE.BufferGeometry();
@@ -178,11 +193,11 @@ tkamb.showMap = function (view, map) {
     map.geometry.setAttribute("level", new THREE.BufferAttribute(new Float32Array(map.count), 1));
     map.geometry.setIndex(new THREE.BufferAttribute(map.triangles, 1));
   }
-  if (view.mapMesh) {  // a new material would be compiled again
-    view.mapMesh.geometry.dispose();
-    view.mapMesh.geometry = map.geometry;
-    return;
-  }
+  return map.geometry;
+}
+
+function mapMesh(geometry) {
+  const {THREE} = MeshCat;
   const material = new THREE.ShaderMaterial({
     uniforms: {scale: {value: tkamb.scale}},
     vertexShader: `attribute float level; varying float shade;
@@ -194,10 +209,10 @@ tkamb.showMap = function (view, map) {
         gl_FragColor = texture2D(scale, vec2(shade * 255.0 / 256.0 + 0.5 / 256.0, 0.5)); }`,
     side: THREE.DoubleSide, polygonOffset: true, polygonOffsetFactor: -2, polygonOffsetUnits: -8,
   });
-  view.mapMesh = new THREE.Mesh(map.geometry, material);
-  view.mapMesh.frustumCulled = false;
-  tkamb.viewer.set_object(tkamb.split(`${view.root}/pressure map/map`), view.mapMesh);
-};
+  const mesh = new THREE.Mesh(geometry, material);
+  mesh.frustumCulled = false;
+  return mesh;
+}
 
 function addMarker(viewer, marker) {
   const {THREE} = MeshCat, colour = new THREE.Color(marker.colour);
