@@ -45,7 +45,7 @@ ALWAYS = {
     "view": "--contact --frame --camera --lattice --html --png --gif --mp4",
     "tradeoff": "--quick --full --peer --recompute --resume --out --force --json",
     "stability": "--quick --resume --workers --out --force --json",
-    "wear": "--close --set --simulator --cycles --updates --law --material --wear-factor "
+    "wear": "--close --set --part --simulator --cycles --updates --law --material --wear-factor "
     "--contact --resolution "
     "--frames-per-cycle --samples --workers --out --force --resume --json",
     "uncertainty": "--contact --resolution --frames --set --dask --screen",

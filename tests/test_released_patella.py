@@ -410,3 +410,39 @@ def test_maps_of_the_button_for_paraview(scene, tmp_path, capsys):
     assert "button.pvd: 2 of 2 frames" in capsys.readouterr().out
     pressure = read_vtp_values(vtk / "button_0001.vtp", "pressure_Pa")
     assert 1e-6 * pressure.max() == pytest.approx(results["button_peak_pressure_MPa"][1], rel=1e-9)
+
+
+def test_the_button_wears_by_load_times_path(scene, tmp_path, capsys):
+    """Archard's law: volume = k N sum of force times path, here by the nodal forces of the run."""
+    import json
+
+    from tkamb.cli import main
+    from tkamb.geometry.frames import transform
+    from tkamb.studies.wear.run import prepare_wear
+
+    out, worn = tmp_path / "out", tmp_path / "worn"
+    results = tkamb.simulate(scene, frames=slice(30, 91, 10), directory=out)
+    words = ["--part", "button", "--law", "archard", "--wear-factor", "1e-7", "--cycles", "1e6"]
+    words += ["--updates", "1", "--close", "as recorded", "--out", str(worn)]
+    assert main(["wear", str(out), *words]) == 0
+    assert "unworn button" in capsys.readouterr().out
+    found = json.loads((worn / "wear.json").read_text(encoding="utf-8"))
+    assert found["part"] == "button" and (worn / "worn_button.stl").is_file()
+    maps, total = results.button_maps, 0.0
+    forces = [np.linalg.norm(maps.frame_data(k)["nodal_force_N"], axis=1) for k in range(7)]
+    for k in range(6):
+        move = maps.femoral_pose[k + 1] @ np.linalg.inv(maps.femoral_pose[k])
+        path = transform(move, maps.points_m) - maps.points_m
+        # The path is tangential: its part along the force of the node is no sliding.
+        along = sum(maps.frame_data(i)["nodal_force_N"] for i in (k, k + 1))
+        size = np.linalg.norm(along, axis=1, keepdims=True)
+        unit = along / np.where(size > 0.0, size, 1.0)
+        path -= np.einsum("ij,ij->i", path, unit)[:, None] * unit
+        total += float(0.5 * (forces[k] + forces[k + 1]) @ np.linalg.norm(path, axis=1))
+    expected = 1e-7 * 1e6 * total  # mm³/(N m), cycles, N m
+    assert found["volume_mm3"] == pytest.approx(expected, rel=0.03)
+    # The viewer of the run does not take it for the insert's wear.
+    assert main(["wear", str(out), *words[:2], "--simulator", "none.csv"]) == 2
+    assert "a simulator has no patella" in capsys.readouterr().err
+    with pytest.raises(InputError, match="no maps of the patellar button"):
+        prepare_wear(scene, part="button", cycles=10)

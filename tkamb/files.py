@@ -287,7 +287,15 @@ OUTPUT_NAMES = frozenset(
         "report.html",
         *("bands.csv", "tornado.csv", "samples.h5", "indices.csv"),
         *("cohort.parquet", "runs.csv", "groups.csv", "cohort.json", "cohort.html"),
-        *("wear.csv", "wear.json", "wear.vtp", "worn_insert.stl", "wear.png", ".wear.npz"),
+        *(
+            "wear.csv",
+            "wear.json",
+            "wear.vtp",
+            "worn_insert.stl",
+            "worn_button.stl",
+            "wear.png",
+            ".wear.npz",
+        ),
     )
 )
 """Names of the files that are replaced together. A journal can rename and remove no others."""

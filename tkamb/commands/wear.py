@@ -29,6 +29,12 @@ def add_wear(commands: Any) -> None:
         "instead of the scene's motion",
         Path,
     )
+    option(
+        wear,
+        "--part NAME",
+        "insert (default), or button: the patellar button of a folder of results",
+        default="insert",
+    )
     option(wear, "--springs F", "springs of the simulator (.toml), for force control", Path)
     option(wear, "--cycles N", f"number of cycles; default {CYCLES:.0e}", _count, default=CYCLES)
     option(
@@ -139,6 +145,7 @@ def _prepared(options: argparse.Namespace) -> "WearRun":
         close=options.close,
         overrides=dict(options.set),
         progress=lambda frames: tqdm(frames, "running", unit="frame", disable=None),
+        part=options.part,
     )
 
 

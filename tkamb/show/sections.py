@@ -299,15 +299,15 @@ def _wear_content(wear: dict[str, Any], picture: str) -> dict[str, Any]:
 def wear_of_run(results: "Results") -> dict[str, Any] | None:
     """Return the content of wear.json in a run's folder; None: the folder has no such file.
 
-    The result is empty if wear.json belongs to another scene, other files or other frames. If the
-    wear was computed from the whole motion or from a simulator's cycle, the frames of the run are
-    not compared.
+    The result is empty if wear.json belongs to the button, another scene, other files or other
+    frames. If the wear was computed from the whole motion or from a simulator's cycle, the frames
+    of the run are not compared.
     """
     folder = results.directory
     if folder is None or not (folder / WEAR_NAME).is_file():
         return None
     result = read_json(folder / WEAR_NAME, MAX_BYTES, what="wear.json")
-    if not isinstance(result, dict) or not result.get("files_sha256"):
+    if not isinstance(result, dict) or not result.get("files_sha256") or result.get("part"):
         return {}
     summary, scenes = results.summary, result.get("scene_sha256")
     identity = summary.get("identity") or {}

@@ -102,6 +102,7 @@ class WearReport:
             "material": self.material.name,
             "sources": list(self.material.sources),
             "creep": None if self.case.creep is None else vars(self.case.creep),
+            **({} if self._insert else {"part": self.setup.part}),
             "contact": self.setup.contact,
             "resolution_mm": self.setup.resolution_mm,
             "source": self.setup.source,
@@ -121,6 +122,10 @@ class WearReport:
             "rows": [{k: _known(v) for k, v in row.items()} for row in self._rows()],
             "code": code_identity(),
         }
+
+    @property
+    def _insert(self) -> bool:
+        return self.setup.part == "insert"
 
     def _rows(self) -> list[dict[str, float]]:
         rows = self.state.rows
@@ -196,7 +201,10 @@ class WearReport:
                 "although they were halved: increase --updates"
             )
         low, high = PUBLISHED_RATES
-        if not low / MAX_PUBLISHED_RATIO <= self.rate <= high * MAX_PUBLISHED_RATIO:
+        if (
+            self._insert
+            and not low / MAX_PUBLISHED_RATIO <= self.rate <= high * MAX_PUBLISHED_RATIO
+        ):
             questions.append(
                 f"{self.rate:.3g} mm3 per million cycles is far from the measured {low:g} (ISO) to "
                 f"{high:g} (in-vivo loads) mm3 of a whole knee (Dreyer 2023): check the wear factor"
@@ -239,6 +247,7 @@ class WearReport:
         own = self._own_factor(result["laws_side_by_side"])
         low, high = result["volume_mm3_range"]
         slow, fast = result["volume_mm3_per_Mc_range"]
+        title = f"laws on the unworn {self.setup.part}"
         others = [
             f"{law['law']} {_factor_words(law['wear_factor_mm3_per_Nm'])}"
             f"{law['first_volume_mm3_per_Mc']:.3g} "
@@ -257,11 +266,7 @@ class WearReport:
             f"range by the wear factor alone: {low:.3g} to {high:.3g} mm3, {slow:.3g} to "
             f"{fast:.3g} mm3 per million cycles ({self.material.range_source})",
             f"geometry: {self.case.law.geometry}",
-            *(
-                [f"laws on the unworn insert, mm3 per million cycles: {', '.join(others)}"]
-                if others
-                else []
-            ),
+            *([f"{title}, mm3 per million cycles: {', '.join(others)}"] if others else []),
             *([] if self.bands is None else self.bands.lines()),
             *self._control_lines(),
             *(f"note: {note}" for note in result["notes"]),
@@ -280,7 +285,10 @@ class WearReport:
         return [f"force control: {', '.join(ranges)}; {len(self.last.failed)} rows failed"]
 
     def write(self, folder: Path) -> None:
-        """Write wear.csv, wear.json, wear.vtp, worn_insert.stl and wear.png, all or none."""
+        """Write wear.csv, wear.json, wear.vtp, worn_insert.stl and wear.png, all or none.
+
+        The mesh of the button is worn_button.stl.
+        """
 
         surface, maps = self._worn(), self._maps()
         with replaced_together(folder) as files:
@@ -289,8 +297,9 @@ class WearReport:
             write_synced(files.path("wear.json"), json.dumps(self.as_dict(), indent=2) + "\n")
             write_triangles(files.path("wear.vtp"), surface.vertices, surface.faces, maps)
             in_mm = trimesh.Trimesh(surface.vertices / MILLIMETRE, surface.faces, process=False)
-            in_mm.export(files.path("worn_insert.stl"), file_type="stl")
-            draw_wear(surface, maps, self._rows(), files.path("wear.png"), self.setup.side)
+            in_mm.export(files.path(f"worn_{self.setup.part}.stl"), file_type="stl")
+            up = "anterior" if self._insert else "superior"
+            draw_wear(surface, maps, self._rows(), files.path("wear.png"), self.setup.side, up)
             files.remove(STATE_NAME)
         remove_shards(folder, SAMPLES_NAME)
 
@@ -341,8 +350,11 @@ def draw_wear(
     rows: Sequence[Mapping[str, float]],
     path: Path,
     side: str,
+    up: str = "anterior",
 ) -> None:
     """Draw the maps of the insert in a superior view, anterior at the top and right on the right.
+
+    Those of the button are seen from the femur, superior at the top.
 
     The last panel shows the worn volume over the cycles, with its band if the rows have one.
 
@@ -350,6 +362,7 @@ def draw_wear(
         surface: insert in the insert frame.
         maps: name -> values at the vertices.
         side: "right" or "left" knee.
+        up: direction of x: "anterior", or "superior" for the button.
     """
     from matplotlib.figure import Figure
 
@@ -358,7 +371,8 @@ def draw_wear(
     columns = (len(maps) + 2) // 2
     ends = ("medial", "lateral") if side == "right" else ("lateral", "medial")
     figure = Figure(figsize=(5.5 * columns, 8), layout="constrained")
-    figure.suptitle(f"{side} knee from above")
+    seen = "knee from above" if up == "anterior" else "patellar button from the femur"
+    figure.suptitle(f"{side} {seen}")
     panels = figure.subplots(2, columns).ravel()
     for axes, (name, values) in zip(panels, maps.items(), strict=False):
         top = float(np.max(values)) or 1.0
@@ -369,7 +383,7 @@ def draw_wear(
             aspect="equal",
             title=LABELS[name],
             xlabel=f"{' ← z, mm → '.join(ends)} (right)",
-            ylabel="x (anterior), mm",
+            ylabel=f"x ({up}), mm",
         )
         figure.colorbar(image, ax=axes, shrink=0.7)
     draw_volume(panels[len(maps)], rows)

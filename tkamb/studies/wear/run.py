@@ -237,6 +237,8 @@ def prepare_wear(
     inputs = wear_setup(path, period=period, check=choice.check, **setup)
     chosen_material, chosen_law = choice.material_and_law
     case = _case(inputs, chosen_material, chosen_law)
+    if samples and inputs.part == "button":
+        raise InputError("the button's wear has no bands", "--samples", "leave it out")
     if samples is None:
         samples = WEAR_BAND.samples if inputs.uncertainty else 0
     sampling = Sampling.of(inputs, case, samples) if samples else None

@@ -10,13 +10,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import ValidationError
 
+from tkamb.contact.model import ContactModel
 from tkamb.contact.registry import contact_model_in_mm, contact_options
-from tkamb.errors import InputError
+from tkamb.errors import InputError, names_near
 from tkamb.geometry.frames import Array, knee_pose
 from tkamb.io.given_material import given_material
 from tkamb.io.scene import Scene, load_scene
 from tkamb.io.scene.case import Case, load_case
-from tkamb.io.scene.tables import ContactTable, WearTable
+from tkamb.io.scene.tables import ContactTable, PatellofemoralTable, WearTable
 from tkamb.io.scene.uncertainty import UncertaintyTable
 from tkamb.run.identity import files_hash, overrides_of_run, preset_of_run, scene_hash
 from tkamb.run.maps import ContactMaps
@@ -49,6 +50,8 @@ class WearSetup:
             does not come from a folder of results.
         uncertainty: table [uncertainty] of the scene; None: the scene has none.
         simulated: whether the motion is a simulator's profile.
+        part: "insert", or "button": then "insert" in other names means the patellar button, in the
+            button frame (`tkamb.knee.button`).
     """
 
     engine: ContactEngine
@@ -63,6 +66,11 @@ class WearSetup:
     run_frames: tuple[int, ...] | None = None
     uncertainty: UncertaintyTable | None = None
     simulated: bool = False
+    part: str = "insert"
+
+
+PARTS = ("insert", "button")
+"""Parts of polyethylene whose wear can be computed."""
 
 
 def wear_setup(
@@ -78,6 +86,7 @@ def wear_setup(
     overrides: Mapping[str, Any] | None = None,
     check: Callable[[WearTable, Path], None] = lambda table, path: None,
     progress: Progress = lambda indices: indices,
+    part: str = "insert",
 ) -> WearSetup:
     """Return bodies, motion and contact of a wear simulation.
 
@@ -95,7 +104,10 @@ def wear_setup(
             [wear], because other keys need another run.
         check: function of [wear] and the path of the scene that is called before frames are run.
         progress: wrapper of the iterator of the frames to run.
+        part: "insert", or "button" for the patellar button of a folder of results.
     """
+    if part not in PARTS:
+        raise InputError(f"no part '{part}'", "--part", names_near(part, PARTS))
     if frames < 2:
         raise InputError(f"{frames} frames", "--frames-per-cycle", "give at least 2")
     path = Path(path)
@@ -107,10 +119,17 @@ def wear_setup(
             raise InputError("a simulator's profile is already closed", "--close", "leave it out")
         check_closing(close)
         keys["wear.close"] = close
+    if part == "button":
+        if simulator is not None:
+            raise InputError("a simulator has no patella", "--simulator", "leave out --part")
+        return _button_setup(path, contact, resolution_mm, frames, keys, check)
     motion: CycleMotion | None = None
     run_frames: tuple[int, ...] | None = None
     if os.path.isdir(path) and simulator is None:
-        case, motion, run_frames, scene_path = _of_results(path, frames, keys)
+        results = read_results(path)
+        case, run_frames, scene_path = _of_results(path, results, keys)
+        assert results.maps is not None
+        motion = _cycle_of_maps(results.maps, case.scene, frames)
         hashes = _hashes(case, case.scene)
     else:
         run_keys: dict[str, Any] = {}
@@ -146,6 +165,51 @@ def wear_setup(
         run_frames=run_frames,
         uncertainty=uncertainty_of(case) if simulator is None else case.scene.uncertainty,
         simulated=simulator is not None,
+    )
+
+
+def _button_setup(
+    path: Path,
+    model: str | None,
+    resolution_mm: float | None,
+    frames: int,
+    keys: Mapping[str, Any],
+    check: Callable[[WearTable, Path], None],
+) -> WearSetup:
+    """Return the result of `wear_setup` for the patellar button of a folder of results.
+
+    Raises:
+        InputError: there is no folder with maps of the button.
+    """
+    results = read_results(path) if os.path.isdir(path) else None
+    if results is None or results.button_maps is None:
+        hint = "run a scene with [contact.patellofemoral], and give its folder"
+        raise InputError("has no maps of the patellar button", path, hint)
+    from tkamb.run.read_scene import recording_of
+
+    case, run_frames, scene_path = _of_results(path, results, keys)
+    check(_wear_table(case.scene), scene_path)
+    table, button = case.scene.contact, recording_of(case, near=True).knee.button_contact
+    assert table is not None and table.patellofemoral is not None and button is not None
+    of_button, pair = table.patellofemoral, button.contact.pair
+    options = dict(of_button.options) if model in (None, of_button.model) else {}
+    used = ContactTable(
+        model=model or of_button.model,
+        resolution_mm=resolution_mm or of_button.resolution_mm,
+        options=options,
+    )
+    return WearSetup(
+        engine=ContactEngine(_model(used), pair.femoral, pair.material, pair.bearing),
+        articular=ArticularSurface.of_insert(pair.insert, used.resolution_mm * MILLIMETRE),
+        motion=_cycle_of_maps(results.button_maps, case.scene, frames),
+        side=case.scene.patient.side,
+        contact=used.model,
+        resolution_mm=used.resolution_mm,
+        source=str(path),
+        scene_sha256=_hashes(case, case.scene),
+        files_sha256=files_hash(case),
+        run_frames=run_frames,
+        part="button",
     )
 
 
@@ -268,13 +332,12 @@ def _cycle_of(
 
 
 def _of_results(
-    folder: Path, most: int, overrides: Mapping[str, Any]
-) -> tuple[Case, CycleMotion, tuple[int, ...], Path]:
+    folder: Path, results: Results, overrides: Mapping[str, Any]
+) -> tuple[Case, tuple[int, ...], Path]:
     for key in overrides:
         if key.partition(".")[0] not in AFTER_A_RUN:
             what = f"'{key}' cannot be changed after the run in this folder"
             raise InputError(what, f"--set {key}", "give the scene instead of the folder")
-    results = read_results(folder)
     if results.maps is None:
         raise InputError("has no contact maps", folder, "run the scene with [contact]")
     keys = overrides_of_run(results.summary) | dict(overrides)
@@ -282,6 +345,11 @@ def _of_results(
     scene = load_scene(scene_path, keys, preset_of_run(results.summary))
     table = results.summary.get("contact")
     if isinstance(table, dict):
+        button = results.summary.get("patellofemoral_contact")
+        if isinstance(button, dict):  # the summary has results beside its keys
+            keys_of = PatellofemoralTable.model_fields
+            own = {key: value for key, value in button.items() if key in keys_of}
+            table = table | {"patellofemoral": own}
         try:
             contact = ContactTable.model_validate(table)
         except ValidationError as error:
@@ -295,8 +363,7 @@ def _of_results(
         what = "was computed with an earlier version of the scene file"
         raise InputError(what, folder, "run the scene again, or give the scene file")
     chosen = (results.summary.get("identity") or {}).get("choice of frames") or ()
-    motion = _cycle_of_maps(results.maps, scene, most)
-    return case, motion, tuple(chosen), scene_path
+    return case, tuple(chosen), scene_path
 
 
 def _scene_of(summary: dict[str, Any], folder: Path) -> Path:
@@ -326,10 +393,12 @@ def _with_contact(
 def _engine(case: Case, table: ContactTable) -> ContactEngine:
     insert = case.scene.implant.insert
     assert insert is not None and case.femoral is not None
+    material = given_material(case.scene.insert_material)
+    return ContactEngine(_model(table), case.femoral, material, insert.bearing)
+
+
+def _model(table: ContactTable) -> ContactModel:
     options = dict(table.options)
     if "cache" in contact_options(table.model):
         options["cache"] = False  # each update of the geometry needs another operator
-    model = contact_model_in_mm(table.model, table.resolution_mm, options)
-    return ContactEngine(
-        model, case.femoral, given_material(case.scene.insert_material), insert.bearing
-    )
+    return contact_model_in_mm(table.model, table.resolution_mm, options)
