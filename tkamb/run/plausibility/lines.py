@@ -60,6 +60,11 @@ PATELLA_HEIGHT, PATELLA_ASIDE = 0.025, 0.025
 three models), and largest distance of both ends from the sagittal plane of the patella."""
 
 
+NEAR_SIDE, FAR_SIDE = 0.001, 0.008
+"""m: distance from the middle beyond which an end on the patella, and one on femur or tibia, is on
+a side. The tuberosity of a symmetric knee is not far from the middle."""
+
+
 def attachment_questions(case: Case) -> Iterator[Question]:
     """Ask about attachments in metres instead of millimetres, or far from the knee."""
     ends = [
@@ -249,11 +254,6 @@ def side_questions(case: Case) -> Iterator[Question]:
             "is the sign of z in point_mm (to the right in both knees), or the name, wrong?",
             "line of the patella on the wrong side",
         )
-
-
-NEAR_SIDE, FAR_SIDE = 0.001, 0.008
-"""m: distance from the middle beyond which an end on the patella, and one on femur or tibia, is on
-a side. The tuberosity of a symmetric knee is not far from the middle."""
 
 
 def _side_of(place: float) -> str:

@@ -128,9 +128,9 @@ def button_poses(run: CaseResults, states: Sequence[ChainState], rows: Sequence[
 def _patella_poses(run: CaseResults, states: Sequence[ChainState], button: Array) -> Array:
     """Return the pose (f, 4, 4) of the patella: that of its contact, or of the equations."""
     poses = np.stack([state.pose("patella") for state in states]) if _has_patella(run) else button
-    contact, known = run.recording.knee.button_contact, np.isfinite(button).all(axis=(1, 2))
+    contact, mapped = run.recording.knee.button_contact, np.isfinite(button).all(axis=(1, 2))
     if contact is not None:
-        poses[known] = button[known] @ inverse(contact.in_patella)
+        poses[mapped] = button[mapped] @ inverse(contact.in_patella)
     return poses
 
 
@@ -142,8 +142,8 @@ def _button_map(results: "Results", poses: Array) -> PressureMap | None:
     maps, rows = results.button_maps, map_rows(results, results.button_maps)
     if maps is None or not rows:
         return None
-    found = _pressure_map(maps, [rows.get(k, -1) for k in range(len(results))])
-    return None if found is None else replace(found, poses=poses)
+    pressure = _pressure_map(maps, [rows.get(k, -1) for k in range(len(results))])
+    return None if pressure is None else replace(pressure, poses=poses)
 
 
 def _pressure_map(maps: "ContactMaps | None", rows: list[int]) -> PressureMap | None:

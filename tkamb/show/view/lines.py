@@ -278,15 +278,15 @@ def _released_strands(
     for head in method.heads:
         paths = [one.paths[head.name] if one and one.found else None for one in loads]
         result.append(_tendon(head.name.replace("_", " "), paths, np.zeros(len(loads), bool)))
-    lost = dict.fromkeys(("femur", "tibia", "patella"), np.full((4, 4), np.nan))
-    found = [one.found if one else None for one in loads]
+    hidden = dict.fromkeys(("femur", "tibia", "patella"), np.full((4, 4), np.nan))
+    equilibria = [one.found if one else None for one in loads]
     poses = {
-        link: np.stack([each.poses[link] if each else lost[link] for each in found])
-        for link in lost
+        link: np.stack([each.poses[link] if each else hidden[link] for each in equilibria])
+        for link in hidden
     }
     for bundle in method.carried:
         points = bundle.points(poses)
-        pulls = np.array([each.tensions[bundle.name] if each else 0.0 for each in found])
+        pulls = np.array([each.tensions[bundle.name] if each else 0.0 for each in equilibria])
         colours = np.broadcast_to(rgb(TENDON), points.shape).copy()
         colours[pulls < SLACK_FORCE] = rgb(SLACK)
         name = bundle.name.replace("_", " ")

@@ -371,8 +371,8 @@ def draw_wear(
     columns = (len(maps) + 2) // 2
     ends = ("medial", "lateral") if side == "right" else ("lateral", "medial")
     figure = Figure(figsize=(5.5 * columns, 8), layout="constrained")
-    seen = "knee from above" if up == "anterior" else "patellar button from the femur"
-    figure.suptitle(f"{side} {seen}")
+    subject = "knee from above" if up == "anterior" else "patellar button from the femur"
+    figure.suptitle(f"{side} {subject}")
     panels = figure.subplots(2, columns).ravel()
     for axes, (name, values) in zip(panels, maps.items(), strict=False):
         top = float(np.max(values)) or 1.0
