@@ -57,7 +57,8 @@ TENSION_TOLERANCE = 1e-7
 # 1: relative difference above which a frame is flagged. A larger one remains where the force of
 # the button's contact jumps from facet to facet.
 FLAGGED_TENSION = 1e-6
-# 1: relative difference above which a frame fails. Such jumps are up to 4e-5.
+# 1: relative difference above which a frame fails. Such jumps are up to 5e-5 of the tension
+# (`scripts/measure/patella_residuals`).
 LARGEST_TENSION = 1e-4
 # 1: evaluations of the patella in one search. Usual are three.
 MAX_TENSIONS = 12

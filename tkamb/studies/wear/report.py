@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
+# 1: cycles of a rate.
 MILLION = 1e6
 STATE_NAME, SAMPLES_NAME = ".wear.npz", ".wear_samples"
 """File of the last finished block and folder of the finished samples, while a simulation is
