@@ -178,6 +178,15 @@ def test_names_of_frames(read):
     assert tkamb.Knee(model).anatomy.patella is None
     hip = tkamb.Knee(model, frames={"hip": None}).anatomy.hip
     assert hip.placement == pin.SE3.Identity() or hip.joint in (1, 2)
+    # Of two frames with one name the frame of the body counts, in any order.
+    both, place = pin.Model(), pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.1]))
+    parts = [
+        both.addJoint(k, pin.JointModelFreeFlyer(), pin.SE3.Identity(), f"j{k}") for k in (0, 1)
+    ]
+    for name, joint in zip(("tibia", "femur"), parts, strict=True):
+        both.addFrame(pin.Frame(name, joint, 0, pin.SE3.Identity(), pin.FrameType.OP_FRAME))
+        both.addFrame(pin.Frame(name, joint, 0, place, pin.FrameType.BODY))
+    assert tkamb.Knee(both).anatomy.femur.placement == place
     bare = pin.Model()
     thigh = bare.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "femur")
     bare.addJointFrame(thigh)
