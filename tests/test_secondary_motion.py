@@ -191,7 +191,9 @@ def test_a_frame_in_equilibrium_whose_equations_fail_has_no_numbers(monkeypatch)
     """Only inputs, computing times and the statistics of the search have finite numbers."""
     overrides = COARSE | {"contact.released": ALL}
     solver = FrameSolver(load_case(load_scene(BEND, overrides)))
-    monkeypatch.setattr("tkamb.knee.frame.solve_knee", lambda *_: unsolved(["no signs are right"]))
+    monkeypatch.setattr(
+        "tkamb.knee.instant.solve_knee", lambda *_: unsolved(["no signs are right"])
+    )
     _, row, arrays = solver.solve(60)
     assert row["status"].startswith("failed: no signs are right")
     finite = {name for name, value in row.items() if name != "status" and np.isfinite(value)}
