@@ -109,7 +109,7 @@ def forces_and_derivatives(
         wrenches[link] = wrenches[link] + wrench
         by_q[link] = by_q[link] + slopes[link]
     shape = knee.model.njoints, 6, knee.model.nv
-    forces, df_dq, df_dv = np.zeros(shape[:2]), np.zeros(shape), np.zeros(shape)
+    df_dq, df_dv = np.zeros(shape), np.zeros(shape)
     for link in LINKS if beside else LINKS[:2]:
         joint, to_joint = knee.bridge.joint_of(link), knee.bridge.to_joint(data.data, link)
         wrench, change, rate = (_users(knee, m[link]) for m in (wrenches, by_q, by_v))
@@ -117,14 +117,13 @@ def forces_and_derivatives(
         # The tibia does not move against the insert; the other bodies do.
         if twist is not None:
             change = change - force_cross(twist, wrench)
-        forces[joint] += to_joint @ wrench
         df_dq[joint] += to_joint @ change
         df_dv[joint] += to_joint @ rate
     for name, line in knee._lines.items():
         if tension := muscle_tensions.get(name, 0.0):
             line.add_derivatives(knee.model, data.data, tension, df_dq)
-    on_joints = pin.StdVec_Force([pin.Force(force) for force in forces])
-    return knee._with_lines(data, muscle_tensions, on_joints), df_dq, df_dv
+    forces = knee.bridge.joint_forces(data.data, wrenches)
+    return knee._with_lines(data, muscle_tensions, forces), df_dq, df_dv
 
 
 def relative_twists(
@@ -405,8 +404,7 @@ def generalised(model: Any, data: Any, changes: Array) -> Array:
         changes: derivative of each joint's force in its joint's frame.
     """
     total = np.zeros((model.nv, changes.shape[2]))
-    for joint in range(1, model.njoints):
-        if changes[joint].any():
-            local = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.LOCAL)
-            total += local.reshape(6, -1).T @ changes[joint]
+    for joint in 1 + np.flatnonzero(changes[1:].any(axis=(1, 2))):
+        local = pin.getJointJacobian(model, data, int(joint), pin.ReferenceFrame.LOCAL)
+        total += local.reshape(6, -1).T @ changes[joint]
     return total

@@ -455,7 +455,8 @@ class Knee(AssembledKnee):
 
         forces, *changes = forces_and_derivatives(self, q, v, tensions, data)
         total = generalised(self.model, data.data, np.concatenate(changes, axis=2))
-        return self._with_external(forces, fext), *np.hsplit(total, 2)
+        nv = self.model.nv
+        return self._with_external(forces, fext), total[:, :nv], total[:, nv:]
 
     def _with_external(self, forces: Any, fext: Any) -> Any:
         if fext is None:
