@@ -10,6 +10,7 @@ import trimesh
 from scipy.special import jv
 
 from contact_bodies import dished_insert, flat_insert, graded_sphere, joined
+from patella_bodies import read_plane
 from tkamb.contact import samples as contact_samples
 from tkamb.contact.foundation import (
     OVER_THE_EDGE,
@@ -20,7 +21,7 @@ from tkamb.contact.foundation import (
     layer_pressure,
     layer_slope,
 )
-from tkamb.contact.materials import material, tabulated_material
+from tkamb.contact.materials import LinearElastic, Material, material, tabulated_material
 from tkamb.contact.pair import ContactPair
 from tkamb.contact.pressing import PRESS, press_by_search, search_load
 from tkamb.contact.registry import contact_model
@@ -435,8 +436,22 @@ TABLE = tabulated_material("table", CURVE, POLYETHYLENE.stress(CURVE), 0.45)
 """The law of a table is not compiled."""
 
 
+class HalfLaw(LinearElastic):
+    """A user's law: half of Hooke's."""
+
+    def stress(self, strain, young_modulus):
+        return 0.5 * super().stress(strain, young_modulus)
+
+    def tangent(self, strain, young_modulus):
+        return 0.5 * super().tangent(strain, young_modulus)
+
+
+HALF = Material("half", LINEAR.young_modulus, LINEAR.poisson_ratio, HalfLaw())
+LAWS = [POLYETHYLENE, LINEAR, TABLE, HALF]
+
+
 @pytest.mark.parametrize("law", ["linear", "nonlinear"])
-@pytest.mark.parametrize("bulk", [POLYETHYLENE, LINEAR, TABLE], ids=lambda bulk: bulk.name)
+@pytest.mark.parametrize("bulk", LAWS, ids=lambda bulk: bulk.name)
 def test_the_compiled_sums_agree_with_numpy(law, bulk):
     """Wrench and centre of each condyle: columns push with p A along the femoral normal."""
     model, state = two_dishes(bulk)
@@ -460,7 +475,7 @@ def test_the_compiled_sums_agree_with_numpy(law, bulk):
         np.testing.assert_allclose(found[side].centre, centre / size[chosen].sum(), 1e-12, 1e-15)
 
 
-@pytest.mark.parametrize("bulk", [POLYETHYLENE, LINEAR, TABLE], ids=lambda bulk: bulk.name)
+@pytest.mark.parametrize("bulk", LAWS, ids=lambda bulk: bulk.name)
 def test_the_stiffness_is_the_slope_of_the_wrench(bulk):
     model, state = two_dishes(bulk)
     pressed = model.press(state, 1500.0, knee_pose([1e-3, 0, 3e-4, 0.01, 0.0, 0.2]))
@@ -491,6 +506,23 @@ def test_a_probe_at_a_far_pose_evaluates_other_columns():
     for x in (0.0, 0.2e-3, 0.4e-3, 1.6e-3, 12e-3):
         expected = model.evaluate(state, lowered(depth, x=x)).wrench_on_insert
         np.testing.assert_allclose(probe.at(lowered(depth, x=x)).wrench, expected, 1e-9, 1e-12)
+
+
+def test_a_probe_finds_columns_of_the_rim_that_the_femur_reaches_from_the_side():
+    """The outer wall of the medial rim is met first after a jump of 3 mm, under 9 kN."""
+    knee = read_plane()[0]
+    state, model = knee.contact.state, ElasticFoundation(1e-3)
+    before, after = (
+        knee_pose(coordinates)
+        for coordinates in (
+            [-0.002645365, 0.029851091, -0.002168045, -0.016922425, -0.007409452, 0.816962509],
+            [-0.005713722, 0.029191236, -0.001941622, 0.026013009, -0.00879225, 0.914931353],
+        )
+    )
+    probe = model.probe(state)
+    probe.at(before)
+    expected = model.evaluate(state, after).wrench_on_insert
+    np.testing.assert_allclose(probe.at(after).wrench, expected, 1e-9, 1e-9)
 
 
 def test_a_probe_of_a_result_is_the_probe_at_its_pose():

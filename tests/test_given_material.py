@@ -7,7 +7,7 @@ import pytest
 
 from scenes import MODEL, write_scene
 from tkamb.cli import main
-from tkamb.contact.materials import LinearElastic, material
+from tkamb.contact.materials import LinearElastic, Material, material
 from tkamb.errors import InputError
 from tkamb.io.given_material import given_material, material_as_json, named_material
 from tkamb.io.scene import load_scene
@@ -171,3 +171,13 @@ def test_an_override_by_a_built_in_name_replaces_the_scene_s_own_material(tmp_pa
     path = write_scene(tmp_path, contact__material=None, material__base="polyethylene")
     named = load_scene(path, {"contact.material": "polyethylene-linear"})
     assert named.material is None and named.contact.material == "polyethylene-linear"
+
+
+def test_a_law_of_the_user_s_own_is_not_described_as_the_built_in_law_that_it_changes():
+    class Half(LinearElastic):
+        def stress(self, strain, young_modulus):
+            return 0.5 * super().stress(strain, young_modulus)
+
+    own = Material("own", 500e6, 0.4, Half())
+    assert not own.is_linear and own.ramberg_osgood is None
+    assert material_as_json(own)["law"] == "Half"

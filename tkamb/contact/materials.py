@@ -231,7 +231,8 @@ class Material:
     @property
     def is_linear(self) -> bool:
         """Whether stress is proportional to strain."""
-        return isinstance(self.law, LinearElastic)
+        # A subclass may have other stresses.
+        return type(self.law) is LinearElastic
 
     @property
     def ramberg_osgood(self) -> tuple[float, float, float] | None:

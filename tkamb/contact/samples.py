@@ -358,9 +358,11 @@ NEAR = 3e-4
 """m: gap below which a column is evaluated."""
 OBLIQUE = 2.0
 """1: largest ratio of the change of a gap, along the column, to the femoral displacement."""
-FARTHEST = 3e-3
+FARTHEST = 1e-3
 """m: upper limit of a stored gap, because another part of the femoral component may approach from
-the side."""
+the side. With 3 mm the probe of the shipped knee missed columns of the rim in 1 of 448 poses that
+jump by 3 mm and 0.4 rad under 6 to 16 kN, and its force was wrong by 300 N. With 1 mm it misses
+none in 2,293 of them."""
 
 
 class Neighbourhood:

@@ -109,16 +109,16 @@ def material_as_json(chosen: Material) -> dict[str, Any]:
     """Return all numbers of a material (stresses in MPa) and their sources."""
     law = chosen.law
     curve: dict[str, Any] = {"law": type(law).__name__}
-    if isinstance(law, LinearElastic):
+    if chosen.is_linear:
         curve = {"law": "linear"}
-    elif isinstance(law, RambergOsgood):
+    elif type(law) is RambergOsgood:
         curve = {
             "law": "ramberg-osgood",
             "alpha": law.alpha,
             "reference_stress_MPa": law.reference_stress / MEGAPASCAL,
             "exponent": law.exponent,
         }
-    elif isinstance(law, TabulatedLaw):
+    elif type(law) is TabulatedLaw:
         scale = chosen.young_modulus / law.young_modulus / MEGAPASCAL
         curve = {
             "law": "tabulated",
