@@ -239,7 +239,7 @@ def test_what_is_wrong_with_the_patella_is_in_words(plain, knee):
     one_sided = knee.patella_equilibrium(q, {"vastus_lateralis": 100.0, "quadriceps": 700.0})
     assert any("medial side" in words for words in one_sided.flags)
     assert sides_without_head({"a": np.array([0, 0, 0.01])}, {"a": 0.0}) == []
-    with pytest.raises(InputError, match="no coordinate 'tild'"):
+    with pytest.raises(InputError, match="no coordinate of the patella 'tild'"):
         knee.patella_equilibrium(q, HEADS, released=("tild",))
     with pytest.raises(InputError, match="is the text 'tilt'"):
         knee.patella_equilibrium(q, HEADS, released="tilt")

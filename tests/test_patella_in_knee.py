@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+import tkamb
 from knee_bodies import whole_body
 from patella_bodies import HEADS, Z, body_knee, read_plane, symmetric
 from test_patella_body import energy
@@ -283,11 +284,16 @@ def test_a_slack_quadriceps_leaves_the_patella_free(plain, knee):
     ("changes", "words"),
     [
         ({"released_patella": ("ap", "tilt")}, "needs ap, si and flexion"),
-        ({"released_patella": ("tild",)}, "no coordinate 'tild'"),
+        ({"released_patella": ("tild",)}, "no coordinate of the patella 'tild'"),
         ({"head_shares": {"quadriceps": 0.5, "sartorius": 0.5}}, "no head 'sartorius'"),
         ({"head_shares": {"quadriceps": 0.5}}, "do not sum to 1"),
         ({"head_shares": {"quadriceps": "all"}}, "head_shares: quadriceps"),
         ({"head_shares": 0.5}, "head_shares"),
+        ({"head_shares": {}}, "do not sum to 1"),
+        ({"head_shares": {"quadriceps": 1.5, "vastus_medialis": -0.5}}, "share 1.5"),
+        ({"released_patella": True}, "released_patella: cannot be True"),
+        ({"released_patella": (0, 1, 3)}, "released_patella: cannot be 0"),
+        ({"released_patella": "ap"}, "released_patella: is the text 'ap'"),
         ({"released_patella": ()}, "needs released_patella="),
     ],
 )
@@ -298,6 +304,41 @@ def test_arguments_that_do_not_fit_are_refused(plain, changes, words):
     }
     with pytest.raises(InputError, match=words):
         body_knee(plain[0], **(given | changes))
+
+
+@pytest.mark.parametrize("kind", [list, np.array, iter])
+def test_names_of_released_coordinates_may_be_any_list(plain, kind):
+    made = body_knee(plain[0], released_patella=kind(["ap", "si", "flexion", "tilt"]))
+    assert made.patella.released == ("ap", "si", "flexion", "tilt")
+
+
+def test_a_muscle_on_the_patella_pulls_it_without_a_share(plain, open_knee):
+    """Its tension reaches femur and tibia through the patella, as that of a head with a share."""
+    q, v = plain[1].q[60], plain[1].v[60]
+    expected = open_knee.external_forces(q, v, HEADS)
+    for shares in (None, {"quadriceps": 1.0}, {"quadriceps": 0.0, "vastus_medialis": 1.0}):
+        other = body_knee(plain[0], released_patella=PATELLA_BODY_COORDINATES, head_shares=shares)
+        forces = other.external_forces(q, v, HEADS)
+        for one, given in zip(expected, forces, strict=True):
+            assert given.vector == pytest.approx(one.vector, abs=1e-6)
+        assert not forces[other.anatomy.patella.joint].vector.any()
+        with pytest.raises(InputError, match="tension of the quadriceps is unknown"):
+            other.inverse_dynamics(*state(plain, 60), tensions={"vastus_medialis": 100.0})
+
+
+def test_a_muscle_that_the_released_patella_would_not_feel_is_refused(plain):
+    source = plain[0]
+    turned = tkamb.Muscle("turned", (("patella", (0.0, 0.0, 0.0)), ("tibia", (0.0, 0.3, 0.0))))
+    with pytest.raises(InputError, match="muscle turned: touches the patella"):
+        tkamb.Knee(
+            source.model,
+            implant=tkamb.Implant(source.femoral, source.insert, source.button, placed=True),
+            extensor=source.extensor,
+            ligaments=body_knee(source).ligaments,
+            muscles=[turned],
+            patellofemoral_contact="foundation",
+            released_patella=PATELLA_BODY_COORDINATES,
+        )
 
 
 def test_what_a_released_patella_does_not_allow_is_refused(plain, knee):

@@ -99,6 +99,22 @@ def not_installed(package: str, where: object, extra: str) -> InputError:
     return InputError(f"{package} is not installed", where, f"pip install 'tkamb[{extra}]'")
 
 
+def names_among(values: Any, names: Iterable[str], where: str, what: str) -> tuple[str, ...]:
+    """Return an argument that lists some of `names`; `what` is their kind in the message.
+
+    Raises:
+        InputError: the argument is a text or no list, or a name is unknown.
+    """
+    all_names = list(names)
+    hint = f"give a list of {', '.join(all_names)}"
+    if isinstance(values, str):
+        raise InputError(f"is the text '{values}'", where, f'give a list: ["{values}"]')
+    for name in (listed := all_of(str, values, where, hint)):
+        if name not in all_names:
+            raise InputError(f"no {what} '{name}'", where, names_near(name, all_names))
+    return listed
+
+
 def names_near(name: str, names: Iterable[str], title: str = "there are") -> str:
     """Return a hint: "did you mean ..." with similar names, then the first few of `names`."""
     all_names = list(names)

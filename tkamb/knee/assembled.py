@@ -16,10 +16,12 @@ from tkamb.errors import (
     InputError,
     all_of,
     must_be,
+    names_among,
     real_number,
     real_numbers,
 )
 from tkamb.geometry.frames import (
+    PATELLA_BODY_COORDINATES,
     Array,
     inverse,
     knee_pose,
@@ -172,11 +174,13 @@ class AssembledKnee:
                 patellofemoral_contact, self.implant, self._surfaces, self.chain, cache
             )
         self.patella: PatellaMethod | None = None
-        self._has_own_patella_lines = bool(released_patella)
-        if released_patella:
+        kind = "coordinate of the patella"
+        released = names_among(released_patella, PATELLA_BODY_COORDINATES, "released_patella", kind)
+        self._has_own_patella_lines = bool(released)
+        if released:
             from tkamb.knee.patella_equilibrium import released_method
 
-            self.patella = released_method(self, released_patella, head_shares)
+            self.patella = released_method(self, released, head_shares)
         elif head_shares is not None:
             raise InputError("needs released_patella=", "head_shares", "give it to the knee")
         self._identity = _identity(self)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pinocchio as pin
 
-from tkamb.errors import ComputationError, InputError, names_near, real_number
+from tkamb.errors import ComputationError, InputError, names_among, real_number
 from tkamb.geometry.frames import (
     KNEE_COORDINATES,
     PATELLA_BODY_COORDINATES,
@@ -715,13 +715,7 @@ class Knee(AssembledKnee):
         from tkamb.knee.released import ReleasedKnee
 
         contact, allowed = self._need_contact(), [n for n in KNEE_COORDINATES if n != "flexion"]
-        if isinstance(released, str):
-            raise InputError(
-                f"is the text '{released}'", "released", f'give a list: ["{released}"]'
-            )
-        for name in released:
-            if name not in allowed:
-                raise InputError(f"no coordinate '{name}'", "released", names_near(name, allowed))
+        released = names_among(released, allowed, "released", "coordinate")
         if derivatives and self.patella is not None:
             hint = "take differences, or a knee with a plane patella"
             raise InputError("not with a released patella", "derivatives", hint)

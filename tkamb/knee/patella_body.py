@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from tkamb.errors import ComputationError, InputError, names_near
+from tkamb.errors import ComputationError, InputError, names_among
 from tkamb.geometry.frames import (
     PATELLA_BODY_COORDINATES,
     Array,
@@ -390,14 +390,9 @@ def released_numbers(names: Sequence[str]) -> tuple[int, ...]:
     """Return the numbers of released coordinates.
 
     Raises:
-        InputError: a name is unknown, given twice, or there is none.
+        InputError: the names are no list, one is unknown or given twice, or there is none.
     """
-    if isinstance(names, str):
-        raise InputError(f"is the text '{names}'", "released", f'give a list: ["{names}"]')
-    for name in names:
-        if name not in PATELLA_BODY_COORDINATES:
-            hint = names_near(name, list(PATELLA_BODY_COORDINATES))
-            raise InputError(f"no coordinate '{name}' of the patella", "released", hint)
+    names = names_among(names, PATELLA_BODY_COORDINATES, "released", "coordinate of the patella")
     if not names or len(set(names)) < len(names):
         raise InputError("names no coordinate, or one twice", "released", "name each once")
     return tuple(k for k, name in enumerate(PATELLA_BODY_COORDINATES) if name in names)

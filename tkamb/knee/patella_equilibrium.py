@@ -196,13 +196,17 @@ def patella_method(
         if name not in ends:
             hint = f"heads of the quadriceps: {', '.join(ends)}"
             raise InputError(f"no head '{name}'", "head_shares", hint)
-        if not 0.0 < real_number(share, f"head_shares: {name}", "give 0 to 1") <= 1.0:
+        if not 0.0 <= real_number(share, f"head_shares: {name}", "give 0 to 1") <= 1.0:
             raise InputError(f"share {share} of '{name}'", "head_shares", "give 0 to 1")
     if shares is not None and abs(sum(shares.values()) - 1.0) > 1e-6:
         raise InputError("the shares do not sum to 1", "head_shares")
+    # A muscle on the patella pulls it also without a share. With shares, the name of a quadriceps
+    # that has none is that of the whole.
+    shared = shares or {}
     heads = tuple(
-        HeadShare(name, *ends[name], share)
-        for name, share in (shares or dict.fromkeys(ends, 0.0)).items()
+        HeadShare(name, *end, shared.get(name, 0.0))
+        for name, end in ends.items()
+        if shares is None or name in shared or name != main.name
     )
     return PatellaMethod(button, knee.chain, heads, knee._others, outline, tuple(released))
 
@@ -227,8 +231,18 @@ def released_method(
         raise InputError(words, "released_patella")
     if knee.button_contact is None or knee.extensor is None:
         raise InputError("needs patellofemoral_contact=", "released_patella", "give it to the knee")
-    method = patella_method(knee, shares or {knee.extensor.quadriceps.name: 1.0}, released)
+    shares = {knee.extensor.quadriceps.name: 1.0} if shares is None else shares
+    method = patella_method(knee, shares, released)
     _check_strands(method)
+    heads = {head.name for head in method.heads}
+    for muscle in knee.muscles:
+        links = [link_point(point).link for point in muscle.points]
+        if muscle.name not in heads and any(_is_on_patella(knee, link) for link in links):
+            raise InputError(
+                "touches the patella, but does not run from the femur to it",
+                f"muscle {muscle.name}",
+                "the released patella would not feel it",
+            )
     return method
 
 
