@@ -1,24 +1,22 @@
 """Femoral adjustment: corrects the errors of fluoroscopy in a recorded pose before contact.
 
-The errors of fluoroscopy are about 0.5 mm and 0.5 deg, which is more than the deformation. Sharma
-(2008), section 4.3, uses both as limits of the correction:
+The errors of about 0.5 mm and 0.5 deg exceed the deformation. Both are limits of the correction
+(Sharma 2008, section 4.3):
 
 1. The coronal angle is the difference of the condyles' gaps at the recorded pose, divided by the
    distance of the contact points in the coronal plane.
-2. If this angle is below 0.5 deg, the femur is turned in the coronal plane until both condyles
-   touch together. A larger angle is evidence of lift-off, and the femur is not turned. It is not
-   turned either if the turn would exceed 0.5 deg.
-3. The femur is moved along y to first touch, by 0.5 mm at most. If first touch is farther away, the
-   frame is flagged. The press then moves the femur along y until the contact carries the load.
-   This limit therefore does not change the medial-lateral split.
+2. Below 0.5 deg, the femur is turned in the coronal plane until both condyles touch together,
+   by 0.5 deg at most. A larger angle is evidence of lift-off: no turn.
+3. The femur is moved along y to first touch, by 0.5 mm at most; else the frame is flagged. The
+   press then moves it along y until the contact carries the load, so that this limit does not
+   change the medial-lateral split.
 
-Sharma (2008) does not give the centre of the turn. Here it is the component's centre, because
-registration places this point best. A turn of 0.4 deg about the contact points, 25 mm below, would
-shift the component sideways by 0.2 mm. In dishes little wider than the condyles the contact would
-move by 1.3 mm, and the total force would change by 0.02 BW.
+Sharma (2008) does not give the centre of the turn. Here it is the component's centre, which
+registration places best. A turn of 0.4 deg about the contact points, 25 mm below, would shift the
+component by 0.2 mm. In dishes little wider than the condyles the contact would move by 1.3 mm, and
+the total force would change by 0.02 BW.
 
-`tkamb.knee.adjustment` compares the adjustment with the deformation, and may
-restore the recorded rotation.
+`tkamb.knee.adjustment` may restore the recorded rotation after the press.
 """
 
 import math
@@ -81,7 +79,6 @@ class Adjustment:
         measured_angle: rad, coronal angle of the recorded pose.
         intercondylar_distance: m, between the contact points in the coronal plane; NaN with one
             condyle.
-        settings: limits of the adjustment.
         penetration: m, penetration after the press; NaN before the press.
         final_angle: rad, difference of the penetrations / intercondylar distance.
         restored: whether the recorded rotation was restored after the press. `pose` is then the
@@ -111,7 +108,6 @@ def adjust(
 
     Args:
         recorded: (4, 4) recorded pose_femoral_in_insert.
-        settings: limits of the adjustment.
 
     Raises:
         InputError: neither condyle is near the insert.
@@ -138,7 +134,7 @@ def _limited_turn(
     distance: float,
     settings: AdjustmentSettings,
 ) -> tuple[float, tuple[str, ...]]:
-    """Return the turn (rad), which is 0 beyond the limit, and a flag close to the limit."""
+    """Return the turn (rad), 0 beyond the limit, and a flag close to the limit."""
     limit, margin = settings.largest_angle, settings.input_change / distance
     if abs(angle) > limit + margin:
         return 0.0, ()
@@ -160,8 +156,7 @@ def moved_to_touch(
 ) -> tuple[Array, float, tuple[str, ...]]:
     """Return a pose (4, 4) moved along y to first touch, as far as the limit allows.
 
-    Returns:
-        The pose, the move along y (m), and a flag if first touch is farther than the limit.
+    Also returns the move along y (m), and a flag if first touch is farther than the limit.
 
     Raises:
         ComputationError: the femur does not lie over the insert.
@@ -241,7 +236,7 @@ def travel_to_touch(query: ClosestPointQuery, at: Array) -> float:
 
 
 def _turned(query: ClosestPointQuery, recorded: Array, turn: float) -> Array:
-    """Return the pose turned about the insert's x axis through the component's centre."""
+    """Turn about the insert's x axis through the component's centre."""
     centre = transform(recorded, query.femoral.bounds.mean(axis=0))
     rotation = Rotation.from_rotvec([turn, 0.0, 0.0]).as_matrix()
     return pose(rotation, centre - rotation @ centre) @ recorded

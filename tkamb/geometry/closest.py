@@ -34,10 +34,7 @@ class HeightBound:
         y <= c + g . (x, z)      for every upward triangle over the cell
 
     g is the mean slope over the cell. On a slope the plane is closer to the surface than the
-    largest height of the cell.
-
-    Args:
-        surface: the surface; the grid covers its extent in x and z.
+    largest height of the cell. The grid covers the surface's extent in x and z.
     """
 
     def __init__(self, surface: Surface) -> None:
@@ -76,13 +73,9 @@ class HeightBound:
         return planes
 
     def _covered(self, low: Array, high: Array) -> Iterator[tuple[Index, tuple[Index, Index]]]:
-        """Yield, in parts, all pairs of a rectangle and a grid cell that it covers.
+        """Yield, in parts, all pairs (m,): a rectangle and a cell that it covers.
 
-        Each part has (m,) numbers of rectangles, and (m,) rows and columns of their cells.
-
-        Args:
-            low: (n, 2) m, smallest x and z of the rectangles.
-            high: (n, 2) m, largest x and z of the rectangles.
+        `low` and `high` (n, 2), m, are the rectangles' smallest and largest x and z.
         """
         first, last = self._place(low), self._place(high)
         wide = (last - first >= WIDE_TRIANGLE_CELLS).any(axis=1)
@@ -137,8 +130,7 @@ class CondyleGap:
             point below the insert's surface, negative.
         point_on_femoral: (3,) m, closest or deepest point of the femoral component.
         point_on_insert: (3,) m, closest point of the insert.
-        centre: (3,) m, on the insert, centre of the close region: the region in which the gap is
-            smallest within the resolution of the meshes.
+        centre: (3,) m, on the insert, centre of the close region (`_CloseRegion`).
         normal: (3,) unit, from the insert to the femur, mean of the insert's vertex normals over
             the close region.
     """
@@ -161,14 +153,12 @@ class CondyleGaps:
 class ClosestPointQuery:
     """Closest points of one pair of bodies, prepared for many poses.
 
-    The gap is the smallest signed distance of the condyle's surface to the insert. It is continuous
-    through touch. If the bodies are apart, it is the exact distance of the two triangulated
-    surfaces (python-fcl). If they overlap, the search finds the deepest femoral vertices in the
-    insert, and divides the triangles around them to 1/8 of an edge. This resolves about 1 µm of
-    depth on implants.
+    The gap is the smallest signed distance of the condyle's surface to the insert, continuous
+    through touch. Apart, it is the exact distance of the two triangulated surfaces (python-fcl). If
+    they overlap, the search finds the deepest femoral vertices and divides the triangles around
+    them to 1/8 of an edge, which resolves about 1 µm of depth on implants.
 
-    The normal is the mean over the close region (`CondyleGap`), because it turns smoothly as the
-    contact moves.
+    The normal is the mean over the close region, because it turns smoothly as the contact moves.
 
     Args:
         femoral: femoral component, femoral frame.
@@ -221,10 +211,7 @@ class ClosestPointQuery:
         return float(distance) * MILLIMETRE, on_femoral, on_insert
 
     def _touching(self, condyle: "_Condyle", pose: Array) -> Index:
-        """Return triangles of the condyle that cut or touch the insert's surface.
-
-        If there is none, return those around the vertex nearest to the insert.
-        """
+        """Return triangles that cut or touch the insert; else those at the nearest vertex."""
         request = fcl.CollisionRequest(
             num_max_contacts=CLOSEST_POINT.batch_size, enable_contact=True
         )
@@ -238,8 +225,7 @@ class ClosestPointQuery:
     def _deepest_vertices(self, condyle: "_Condyle", pose: Array) -> Index:
         """Return the `kept_candidates` deepest vertices inside the insert, deepest first.
 
-        A vertex above the bound of the insert's height is outside. The depth along y is an upper
-        bound of the depth; vertices are evaluated in the order of this bound.
+        The depth along y is an upper bound of the depth; vertices are evaluated in its order.
         """
         near, points = _within_box(condyle.points, pose, *self.insert.bounds)
         under = points[:, 1] < self._ceiling.over(points) + CLOSEST_POINT.clearance
@@ -262,10 +248,7 @@ class ClosestPointQuery:
         return np.where(inside, distance, 0.0)
 
     def _refined(self, faces: Index, pose: Array) -> tuple[float, Array, Array]:
-        """Return the gap (m) of the deepest point of triangles, this point, and its projection.
-
-        The projection is the nearest point of the insert.
-        """
+        """Return the gap (m) of the deepest point of triangles, the point, and its insert point."""
         corners = self.femoral.triangles[faces]
         triangles = transform(pose, corners.reshape(-1, 3)).reshape(-1, 3, 3)
         _, first = np.unique(self.femoral.faces[faces], return_index=True)
@@ -289,8 +272,6 @@ class ClosestPointQuery:
 
 
 class _Condyle:
-    """Triangles, vertices and bounding-box tree of one condyle."""
-
     def __init__(self, femoral: Surface, faces: Index) -> None:
         self.faces, self._femoral = faces, femoral
         self.vertices = np.unique(femoral.faces[faces])
@@ -302,11 +283,9 @@ class _Condyle:
 
     @cached_property
     def tree(self) -> fcl.BVHModel:
-        """Bounding-box tree of the triangles for fcl."""
         return _tree(self._femoral, self.faces)
 
     def placed(self, pose: Array) -> fcl.CollisionObject:
-        """Return the condyle's tree at a pose (4, 4)."""
         place = fcl.Transform(pose[:3, :3], pose[:3, 3] / MILLIMETRE)
         return fcl.CollisionObject(self.tree, place)
 
@@ -327,9 +306,7 @@ class _CloseRegion:
     the smallest gap and d the depth of a facet (`CONDYLE.facet_depth`). If the gap has a sharp
     minimum, the centre is the closest point.
 
-    Args:
-        surface: surface of the body, in the body's frame.
-        faces: (k,) numbers of the triangles of the part.
+    `faces` (k,) are the triangles of the part.
     """
 
     def __init__(self, surface: Surface, faces: Index) -> None:
@@ -341,15 +318,10 @@ class _CloseRegion:
     def centre(
         self, other: NearestPoints, pose: Array, gap: float, closest: Array
     ) -> tuple[Array, Array]:
-        """Return the centre (3,), m, and the mean unit normal (3,) of the close region.
+        """Return centre (3,), m, and mean unit normal (3,) of the close region on the other body.
 
-        Both belong to the other body and are given in its frame.
-
-        Args:
-            other: nearest points of the other body.
-            pose: (4, 4) pose of this body in the other body's frame.
-            gap: m, smallest signed gap.
-            closest: (3,) m, point of this body with this gap, in the other body's frame.
+        Both are in the other body's frame, like `closest` (3,), m, this body's point with the
+        smallest signed `gap` (m). `pose` (4, 4) is this body in the other body's frame.
         """
         place = transform(inverse(pose), closest)
         near = _facing_alike(self._samples, self._normals, place, CLOSEST_POINT.region_radius)
@@ -372,10 +344,7 @@ class _CloseRegion:
 
 
 def _thinned(samples: Array, areas: Array) -> tuple[Index, Array]:
-    """Return one sample (m,) per cube, and the area (m,) of all samples in the cube.
-
-    The edge of a cube is the sample spacing.
-    """
+    """Return one sample (m,) per cube of the sample spacing, and the area (m,) of its samples."""
     cubes = np.floor(samples / CONDYLE.sample_spacing).astype(np.int64)
     cubes -= cubes.min(axis=0)
     number = np.ravel_multi_index(tuple(cubes.T), tuple(cubes.max(axis=0) + 1))
@@ -399,7 +368,7 @@ def _tree(surface: Surface, faces: Index) -> fcl.BVHModel:
 
 @compiled_as_written
 def _within_box(points: Array, pose: Array, low: Array, high: Array) -> tuple[Index, Array]:
-    """Return the numbers and the new positions of points (n, 3) that a pose moves into a box."""
+    """Return numbers and new positions of points (n, 3) that a pose moves into a box."""
     inside, places, count = np.empty(len(points), np.int64), np.empty((len(points), 3)), 0
     for i in range(len(points)):
         within = True
@@ -419,14 +388,7 @@ def _within_box(points: Array, pose: Array, low: Array, high: Array) -> tuple[In
 
 @compiled_as_written
 def _facing_alike(samples: Array, normals: Array, place: Array, radius: float) -> Index:
-    """Return the samples near a place with a normal within 60 deg of the nearest sample's normal.
-
-    Args:
-        samples: (n, 3) m.
-        normals: (n, 3) unit normals of the samples.
-        place: (3,) m.
-        radius: m, largest distance of a sample from the place.
-    """
+    """Return the samples within `radius` (m) whose normals are within 60 deg of the nearest's."""
     square, nearest = np.empty(len(samples)), 0
     for i in range(len(samples)):
         x, y, z = samples[i, 0] - place[0], samples[i, 1] - place[1], samples[i, 2] - place[2]
@@ -447,7 +409,6 @@ def _facing_alike(samples: Array, normals: Array, place: Array, radius: float) -
 
 @compiled_as_written
 def _quartered(triangles: Array) -> Array:
-    """Divide triangles (k, 3, 3) at the middles of their edges; return the parts (4k, 3, 3)."""
     count = len(triangles)
     parts = np.empty((4 * count, 3, 3))
     for k in range(count):

@@ -3,9 +3,9 @@
 The import takes 0.1 to 0.4 s. The compiled code is stored beside the module, or in the user's cache
 (`NUMBA_CACHE_DIR`) if that folder cannot be written. Indices are not checked against bounds.
 
-Numba's cache detects changes of a function's own file only. A compiled function may call compiled
-functions of other files, because its stored name contains a hash of these files. It uses no other
-name of another file.
+A compiled function may call compiled functions of other files, because its stored name contains a
+hash of these files. Numba's cache detects changes of its own file only, so it uses no other name of
+another file.
 """
 
 import hashlib

@@ -102,14 +102,12 @@ YAW_SEARCH = YawSearch()
 def condyle_split(femoral: Surface) -> float | None:
     """Return the z (m, femoral frame) between the condyles; None for a single condyle.
 
-    The outline is the lowest height of the surface in each strip of 1 mm along z, above the lowest
-    point of all strips. It is averaged over flexions from 0 to 120 deg (rotation about +z, as in
-    `tkamb.geometry.frames`). Two condyles are two valleys of the outline, and the notch between
-    them is a ridge. The ridge must rise at least 3 mm above both valleys, or 2 mm if it exists in
-    extension, too. The split is the middle of the ridge at half its height. A sphere, a cylinder
-    along z or a unicondylar component has one valley.
-
-    In a right knee z above the split is lateral, below it medial.
+    The outline is the lowest height of the surface in each strip of 1 mm along z, averaged over
+    flexions from 0 to 120 deg (about +z, as in `tkamb.geometry.frames`). Two condyles are two
+    valleys of the outline. The ridge between them must rise at least 3 mm above both, or 2 mm if it
+    exists in extension, too. The split is the middle of the ridge at half its height. A sphere, a
+    cylinder along z or a unicondylar component has one valley. In a right knee z above the split is
+    lateral.
 
     Args:
         femoral: femoral component, femoral frame (x anterior, y superior, z right).
@@ -139,12 +137,9 @@ def condyle_split(femoral: Surface) -> float | None:
 def condyle_yaw(femoral: Surface, search: YawSearch = YAW_SEARCH) -> tuple[float, float]:
     """Return the angle between z and the line through both condyles, and the depth of the notch.
 
-    The notch is searched along horizontal directions. It is deepest along the line through both
-    condyles. The angle is the mean over the directions with a notch deeper than half the deepest
-    one, weighted by depth.
-
-    Args:
-        femoral: femoral component, femoral frame.
+    The notch is searched along horizontal directions; it is deepest along the line through both
+    condyles. The angle is the mean over directions with more than half this depth, weighted by
+    depth.
 
     Returns:
         Angle about +y, rad, in (-90, 90] deg, and depth of the deepest notch, m. Without a notch
@@ -201,14 +196,10 @@ class Orientation:
 def orientation(femoral: Surface, pose: Array) -> Orientation | None:
     """Return the orientation of a femoral component on the insert; None if its shape is unclear.
 
-    Of the mesh's axes only z is used, the medial-lateral axis. The inner surface of the component
-    faces the middle of its bounding box. The sum of the inner surface's area vectors points out of
-    the opening, towards the bone. The upper half of the strip between the condyles belongs to the
-    flange, which is in front. The error of the flexion is about 10 deg.
-
-    Args:
-        femoral: femoral component, femoral frame.
-        pose: (4, 4) pose_femoral_in_insert.
+    Of the mesh's axes only z is used, the medial-lateral axis. The inner surface faces the middle
+    of the bounding box; the sum of its area vectors points out of the opening, towards the bone.
+    The upper half of the strip between the condyles belongs to the flange, which is in front. The
+    error of the flexion is about 10 deg. `pose` is pose_femoral_in_insert (4, 4).
     """
     middle, centroids = femoral.bounds.mean(axis=0), femoral.triangles.mean(axis=1)
     inner = np.einsum("kj,kj->k", femoral.face_normals, centroids - middle) < 0.0
@@ -254,7 +245,7 @@ def orientation(femoral: Surface, pose: Array) -> Orientation | None:
 def condyle_faces(femoral: Surface, split: float | None) -> tuple[Index, Index]:
     """Return the triangles (k,) of the medial and of the lateral condyle.
 
-    The centroid of a triangle decides its side. Without a split all triangles are medial.
+    A triangle's centroid decides its side. Without a split all triangles are medial.
     """
     if split is None:
         return np.arange(len(femoral.faces)), np.empty(0, np.int64)
@@ -269,13 +260,7 @@ def _samples(femoral: Surface, spacing: float) -> Array:
 
 
 def _mean_outline(samples: Array, width: float, flexions: Array) -> tuple[Array, Array]:
-    """Return height (n,), m, of the outline above its lowest point, and z (n,), m, of its strips.
-
-    Args:
-        samples: (s, 3) m, samples of the surface.
-        width: m, width of the strips along z.
-        flexions: (f,) rad, flexions over which the outline is averaged.
-    """
+    """Return height (n,), m, of the outline above its lowest point, and z (n,), m, of strips."""
     low, high = samples[:, 2].min(), samples[:, 2].max()
     count = max(int(np.ceil((high - low) / width)), 3)
     strip = np.clip(((samples[:, 2] - low) / (high - low) * count).astype(int), 0, count - 1)
@@ -302,13 +287,9 @@ def _rise(outline: Array) -> Array:
 class LowestPoints:
     """Lowest point of each condyle along the insert's y, prepared for many poses.
 
-    The point has the y of the lowest vertex. Its x and z are a weighted mean over the condyle's
-    surface. The weight is exp(-height / `CONDYLE.facet_depth`), with the height above the lowest
-    vertex. The point therefore moves smoothly and does not jump from vertex to vertex.
-
-    Args:
-        femoral: femoral component, femoral frame.
-        split: z (m, femoral frame) between the condyles; None for one condyle.
+    The point has the y of the lowest vertex. Its x and z are means over the condyle's surface with
+    the weight exp(-height / `CONDYLE.facet_depth`), height above the lowest vertex. The point
+    therefore moves smoothly. `split` is z (m, femoral frame) between the condyles; None for one.
     """
 
     def __init__(self, femoral: Surface, split: float | None) -> None:
@@ -319,10 +300,7 @@ class LowestPoints:
                 self._condyles.append(_SampledCondyle.of(part))
 
     def at(self, pose_femoral_in_insert: Array) -> tuple[Array, Array | None]:
-        """Return the points (3,) m, insert frame, of the medial and the lateral condyle.
-
-        The lateral point is None for a component with one condyle.
-        """
+        """Return the medial and the lateral point (3,), m, insert frame; None for no condyle."""
         pose = np.asarray(pose_femoral_in_insert, float)
         points = [condyle.lowest(pose) for condyle in self._condyles]
         return points[0], points[1] if len(points) > 1 else None
@@ -332,12 +310,7 @@ class LowestPoints:
 class _SampledCondyle:
     """Samples of a condyle in small boxes; only samples in low boxes are evaluated.
 
-    Args:
-        vertices: (v, 3) m, femoral frame.
-        samples: (n, 3) m, femoral frame.
-        areas: (n,) m², area of each sample.
-        centres: (b, 3) m, centres of the boxes.
-        halves: (b, 3) m, half the edges of the boxes.
+    Vertices, samples, box centres and half edges are (·, 3), m, femoral frame; areas (n,), m².
     """
 
     vertices: Array
@@ -356,7 +329,6 @@ class _SampledCondyle:
         return cls(vertices, samples, areas, (low + high) / 2, (high - low) / 2)
 
     def lowest(self, pose: Array) -> Array:
-        """Return the lowest point (3,) m, insert frame."""
         heights = self.vertices @ pose[1, :3]
         lowest, bottom = self.vertices[np.argmin(heights)], heights.min()
         candidates = self._low_samples(pose[1, :3], bottom + CONDYLE.highest_sample)

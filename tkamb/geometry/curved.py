@@ -25,19 +25,17 @@ class CurvedSurface:
 
         h = 4 (b2 b3 s1 + b3 b1 s2 + b1 b2 s3),    s = t_i t_j / (2 (t_i + t_j))
 
-    h is the height of the patch over the triangle, and s is the sagitta of the edge e from corner i
-    to j, with corner normals n. t_i = -n_i.e / n_i.N is the height of the tangent plane of corner i
-    over corner j, and t_j = n_j.e / n_j.N that of corner j over i. On a quadratic surface both are
-    equal, and h is exact. If the signs of t_i and t_j differ, s is zero. A flat that meets a fillet
-    therefore stays flat. On a flat subdivision the patches are those of the coarser triangles
-    (`coarsened`).
+    h is the height over the triangle, s the sagitta of the edge e from corner i to j, with corner
+    normals n. t_i = -n_i.e / n_i.N is the height of the tangent plane of corner i over corner j,
+    and t_j = n_j.e / n_j.N that of j over i. On a quadratic surface both are equal, and h is exact.
+    If their signs differ, s is zero: a flat that meets a fillet stays flat. On a flat subdivision
+    the patches are those of the coarser triangles (`coarsened`).
 
     Args:
         surface: triangles of the patches, with shared vertices.
         normals: (k, 3, 3) unit normals at the corners, see `Surface.corner_normals`.
         sagittas: (k, 3) m, sagitta of the edge opposite each corner, along the triangle's normal.
-        finer: finer triangles on which points are given; None if points are given on the triangles
-            of `surface`.
+        finer: finer triangles on which points are given; None for those of `surface`.
 
     Reference:
         Vlachos et al., Curved PN triangles, Proc I3D 2001, doi:10.1145/364338.364387 (the
@@ -60,7 +58,7 @@ class CurvedSurface:
 
     @cached_property
     def _patches(self) -> Array:
-        """Corner normals, sagittas and the triangle's normal, in one row per triangle (k, 15)."""
+        """Corner normals, sagittas and normal of each triangle (k, 15)."""
         return np.hstack([self.normals.reshape(-1, 9), self.sagittas, self.surface.face_normals])
 
     def shift(self, faces: Index, weights: Array, direction: Array) -> tuple[Array, Array]:
@@ -119,10 +117,9 @@ def crossed_patch(
 ) -> float:
     """Return the distance (m) of a ray's crossing with a patch, which is exact.
 
-    The height above the patch has the gradient q and minus the second derivative H
-    (`CurvedSurface.quadratics`). Both are those of the surface that the ray meets, so that the
-    distance of a point that moves by u changes by (q . u)/(q . direction). A ray that passes its
-    patch keeps its distance.
+    The height above the patch has the gradient q and minus the second derivative H, both those of
+    the surface that the ray meets. If the point moves by u, the distance changes by (q . u)/(q .
+    direction). A ray that passes its patch keeps its distance.
 
     Args:
         quadratics: `CurvedSurface.quadratics`.
@@ -158,7 +155,6 @@ def crossed_patch(
 
 @compiled_as_written
 def _shifts(patches: Array, faces: Index, weights: Array, direction: Array) -> tuple[Array, Array]:
-    """Return the result of `CurvedSurface.shift` from rows of `CurvedSurface._patches`."""
     shifts, normals = np.full(len(faces), np.nan), np.full((len(faces), 3), np.nan)
     for n in range(len(faces)):
         if faces[n] < 0:

@@ -136,9 +136,9 @@ def _loops(surface: "Surface") -> list[BoundaryLoop]:
 def _opening(surface: "Surface", loop: BoundaryLoop) -> Defect:
     """Return an opening, with points on the smooth cap that would close it.
 
-    The cap is a paraboloid over the loop's mean plane. Its sagitta is half of the mean height of
-    the loop's tangent planes above the centre. If the surface lies within the loop, like a sheet
-    within its edge, no cap is missing, and the points are the edge.
+    The cap is a paraboloid over the loop's mean plane, with half the mean height of the loop's
+    tangent planes above the centre. If the surface lies within the loop, like a sheet within its
+    edge, no cap is missing, and the points are the edge.
     """
     ring = surface.vertices[loop.vertices]
     words = f"an opening {loop.width / MILLIMETRE:.2g} mm wide"

@@ -43,15 +43,11 @@ class FirstTouch:
     """Vertical clearance between two triangulated surfaces, exact for their triangles.
 
     The clearance of two triangles is the smallest difference of their heights over the polygon that
-    both cover in the plan view. The difference is linear, so it is smallest at a corner of this
-    polygon. The search skips pairs of boxes and triangles that cannot have a smaller clearance than
-    the smallest one so far.
+    both cover in the plan view; the difference is linear, so it is smallest at a corner. Pairs of
+    boxes and triangles without a smaller clearance than the smallest so far are skipped.
 
-    Args:
-        femoral: femoral component, femoral frame.
-        insert: insert, insert frame.
-        split: z (m, femoral frame) between the condyles; None for one condyle, which is medial. The
-            centroid of a triangle decides its side.
+    `split` is z (m, femoral frame) between the condyles; None for one condyle, which is medial. The
+    centroid of a triangle decides its side.
     """
 
     def __init__(self, femoral: Surface, insert: Surface, split: float | None = None) -> None:
@@ -64,7 +60,6 @@ class FirstTouch:
 
     @cached_property
     def _condyles(self) -> list[tuple[Array, Array, Array] | None]:
-        """Trees of the medial and the lateral condyle; None for a side without a triangle."""
         sides = condyle_faces(self._femoral, self._split)
         return [
             _arrays(TriangleTree(self._femoral, faces)) if len(faces) else None for faces in sides
@@ -73,10 +68,8 @@ class FirstTouch:
     def at(self, pose: ArrayLike) -> tuple[Touch | None, Touch | None]:
         """Return the touch of the medial and of the lateral condyle.
 
-        A touch is None if no part of that condyle lies over the insert, or the pose is not finite.
-
-        Args:
-            pose: (4, 4) pose_femoral_in_insert; the travel starts at its y.
+        A touch is None if no part of that condyle lies over the insert, or `pose`,
+        pose_femoral_in_insert (4, 4), is not finite.
         """
         pose = np.asarray(pose, float)
         if self._split is None:
@@ -127,17 +120,9 @@ def _bound(
 ) -> float:
     """Return a lower bound (m) of the clearance of the triangles in two boxes.
 
-    It is the larger of the boxes' clearance and of their planes' clearance over the rectangle that
-    both boxes cover. It is inf if the boxes do not overlap in the plan view.
-
-    Args:
-        upper: (6,) m, box of the upper body, in the lower body's frame.
-        lower: (6,) m, box of the lower body.
-        upper_support: (4,) plane of the upper box (`TriangleTree.supports`), in the upper body's
-            frame.
-        lower_support: (4,) plane of the lower box.
-        rotation: (3, 3) rotation from the upper body's frame to the lower body's.
-        translation: (3,) m, origin of the upper body's frame in the lower body's.
+    It is the larger of the boxes' clearance and of their planes' over the rectangle that both
+    cover; inf if they do not overlap in the plan view. Boxes (6,) are in the lower body's frame,
+    planes (4,) (`TriangleTree.supports`) each in its own; the pose is the upper frame in the lower.
     """
     x0, x1 = max(upper[0], lower[0]), min(upper[3], lower[3])
     z0, z1 = max(upper[2], lower[2]), min(upper[5], lower[5])
@@ -161,13 +146,10 @@ def _bound(
 
 @compiled_as_written
 def _plane(corners: Array) -> tuple[float, float, float, float]:
-    """Return h, a and b of a triangle's plane y = h + a x + b z, and an area.
+    """Return h, a and b of a triangle's (9,) plane y = h + a x + b z, and a signed area.
 
-    The area is twice the triangle's area in the plan view, m²; it is negative if the triangle faces
-    down, and zero for a wall.
-
-    Args:
-        corners: (9,) m, corners of the triangle.
+    The area is twice that in the plan view, m²; negative if the triangle faces down, zero for a
+    wall.
     """
     ux, uy, uz = corners[3] - corners[0], corners[4] - corners[1], corners[5] - corners[2]
     vx, vy, vz = corners[6] - corners[0], corners[7] - corners[1], corners[8] - corners[2]
@@ -180,7 +162,6 @@ def _plane(corners: Array) -> tuple[float, float, float, float]:
 
 @compiled_as_written
 def _over(upper: Array, lower: Array) -> bool:
-    """Return whether the bounding rectangles of two triangles (9,) overlap in the plan view."""
     for axis in (0, 2):
         a, b, c = upper[axis], upper[axis + 3], upper[axis + 6]
         d, e, f = lower[axis], lower[axis + 3], lower[axis + 6]
@@ -212,7 +193,7 @@ def _cut(
 ) -> int:
     """Write the part of a polygon on one side of the line from a to b; return its corner count.
 
-    A corner (3,) consists of x, z and clearance, m. `way` is 1 or -1 and selects the side.
+    A corner (3,) is x, z and clearance, m. `way`, 1 or -1, selects the side.
     """
     number = 0
     for corner in range(count):
@@ -246,16 +227,11 @@ def _over_each_other(
     spare: Array,
     point: Array,
 ) -> float:
-    """Return the smaller of the clearance (m) of two triangles and the smallest one so far.
+    """Return the smaller of the clearance (m) of two triangles and `best`, the smallest so far.
 
-    Args:
-        upper: (9,) m, corners of the upper triangle, in the lower body's frame.
-        lower: (9,) m, corners of the lower triangle.
-        plane: plane of the lower triangle, see `_plane`; its area is not zero.
-        best: m, smallest clearance so far.
-        polygon: (`MOST_CORNERS`, 3) work array.
-        spare: (`MOST_CORNERS`, 3) work array.
-        point: (3,) m, output, place of a smaller clearance on the lower triangle.
+    Corners `upper` and `lower` (9,), m, are in the lower body's frame; `plane` is that of `lower`
+    (`_plane`), its area is not zero. `polygon` and `spare` (`MOST_CORNERS`, 3) are work arrays;
+    `point` (3,) receives the place of a smaller clearance on the lower triangle.
     """
     height, a, b, area = plane
     for corner in range(3):
@@ -290,18 +266,9 @@ def _least_clearance(
 ) -> tuple[float, Array]:
     """Return the smallest clearance (m) of two surfaces, and its place (3,), m, on the lower one.
 
-    Boxes, supports and corners are those of `TriangleTree`, in the frame of each surface. The
-    clearance is inf if the surfaces do not overlap in the plan view.
-
-    Args:
-        upper_boxes: (2 p, 6) m, boxes of the upper surface.
-        upper_supports: (2 p, 4) planes of these boxes.
-        upper_corners: (p c, 9) m, triangles in the leaves.
-        lower_boxes: (2 q, 6) m, boxes of the lower surface.
-        lower_supports: (2 q, 4) planes of these boxes.
-        lower_corners: (q d, 9) m, triangles in the leaves.
-        rotation: (3, 3) rotation from the upper surface's frame to the lower surface's.
-        translation: (3,) m, origin of the upper surface's frame in the lower surface's.
+    Boxes (2 p, 6), supports (2 p, 4) and corners (p c, 9) are those of `TriangleTree`, in the frame
+    of each surface; the pose is the upper frame in the lower. The clearance is inf if the surfaces
+    do not overlap in the plan view.
     """
     best, point = np.inf, np.full(3, np.nan)
     uppers, lowers = len(upper_boxes) // 2, len(lower_boxes) // 2

@@ -67,10 +67,9 @@ class FlatBottom:
 def find_flats(surface: Surface) -> list[FlatBottom]:
     """Return the flats that may be the bottom, largest first.
 
-    The search weights triangles by area. It finds the direction that most triangles face, and then
-    the most frequent offset of the triangles within 15 deg of it. A plane is fitted to these
-    triangles several times, with smaller and smaller tolerances. The triangles of the flat are then
-    removed, and the search is repeated until no flat of comparable area remains.
+    Triangles are weighted by area. The search finds the direction that most triangles face, then
+    the most frequent offset of those within 15 deg of it, and fits a plane to them with decreasing
+    tolerances. It is repeated without this flat until no flat of comparable area remains.
     """
     normals, area = surface.face_normals, surface.areas
     free = area > 0
@@ -94,10 +93,8 @@ def find_flat_bottom(surface: Surface, rotation: Array | None = None) -> FlatBot
     Its area must be at least half of the largest flat's area. A notice is printed if its area is
     clearly smaller.
 
-    Args:
-        surface: insert in anatomical axes (x anterior, y superior, z right), m.
-        rotation: (3, 3) rotation from mesh axes to anatomical axes, for the mesh's axes in
-            messages.
+    `surface` is in anatomical axes (x anterior, y superior, z right), m. `rotation` (3, 3) from
+    mesh axes to these serves the messages.
 
     Raises:
         InputError: there is no flat, none faces -y, or two are about equally large.
@@ -168,9 +165,7 @@ def insert_placement(surface: Surface, rotation: Array | None = None) -> Array:
     The plane y = 0 of the insert frame is the flat bottom, which faces -y. The origin is the centre
     of the bottom's bounding rectangle in x and z. The smallest rotation turns a tilted mesh level.
 
-    Args:
-        surface: insert in anatomical axes with the mesh's origin, m.
-        rotation: (3, 3) see `find_flat_bottom`.
+    `surface` and `rotation`: see `find_flat_bottom`.
 
     Raises:
         InputError: see `find_flat_bottom`.
@@ -199,7 +194,6 @@ def _described(flat: FlatBottom, rotation: Array) -> str:
 
 
 def _levelling(normal: Array) -> Array:
-    """Return the smallest rotation (3, 3) that turns the normal to -y."""
     axis = np.cross(normal, [0.0, -1.0, 0.0])
     sine = float(np.linalg.norm(axis))
     if sine < LEVEL_TILT:
@@ -305,10 +299,7 @@ def _median(values: Array, weight: Array) -> float:
 
 
 def _plane(corners: Array, weight: Array, towards: Array) -> tuple[Array, float]:
-    """Return normal (3,) and offset (m) of the least-squares plane of triangles (k, 3, 3).
-
-    The squares are integrated over the area, exactly for each triangle.
-    """
+    """Return normal (3,) and offset (m) of the least-squares plane over the area of triangles."""
     total = weight.sum()
     middle = corners.mean(axis=1)
     centre = weight @ middle / total

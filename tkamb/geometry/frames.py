@@ -153,15 +153,10 @@ def mirrored_pose(pose_a_in_b: ArrayLike) -> Array:
 
 
 def knee_twist(coordinates: ArrayLike, rates: ArrayLike) -> tuple[Array, Array]:
-    """Return the femur's velocity relative to the insert.
+    """Return the femur's velocity relative to the insert, insert frame.
 
-    Args:
-        coordinates: (..., 6) knee coordinates, m and rad.
-        rates: (..., 6) time derivatives of the coordinates, m/s and rad/s.
-
-    Returns:
-        Velocity (..., 3) m/s of the femoral origin and angular velocity (..., 3) rad/s, both
-        in the insert frame.
+    `rates` (..., 6) are those of the knee `coordinates`, m/s and rad/s. The result is the velocity
+    (..., 3), m/s, of the femoral origin, and the angular velocity (..., 3), rad/s.
     """
     rate = np.asarray(rates, float)
     return rate[..., :3], np.einsum("...i,...ij->...j", rate, knee_axes(coordinates)[..., 3:])
@@ -173,9 +168,6 @@ def knee_axes(coordinates: ArrayLike) -> Array:
     The generalised forces of a wrench w on the femur (force, then moment about the insert's origin)
     are `knee_axes(q) @ w`.
 
-    Args:
-        coordinates: (..., 6) knee coordinates, m and rad.
-
     Returns:
         (..., 6, 6), insert frame. Row i is the twist for a unit rate of coordinate i: the velocity
         of the femur's point at the insert's origin, then the angular velocity.
@@ -186,7 +178,6 @@ def knee_axes(coordinates: ArrayLike) -> Array:
 
 @lru_cache(maxsize=32)
 def _axes_of_knee(coordinates: bytes) -> Array:
-    """Return the axes at one pose; they are cached, because a search needs them repeatedly."""
     return _axes_of_knees(np.frombuffer(coordinates))
 
 
@@ -213,9 +204,9 @@ def sagittal_pose(coordinates: Array) -> Array:
 
 
 def displaced(femur_pose: Array, displacement: Array) -> Array:
-    """Return a pose (4, 4) moved by a displacement (6,): translation, then rotation vector.
+    """Return a pose (4, 4) moved by translation and rotation vector (6,), insert frame.
 
-    The rotation is about the insert's origin. All vectors are in the insert frame.
+    The rotation is about the insert's origin.
     """
     from scipy.spatial.transform import Rotation
 

@@ -1,16 +1,15 @@
 """The intervals in which the lines of a structured grid run inside a closed surface.
 
-Every triangle is compared with the grid lines that cross its bounding rectangle in the plane normal
-to the lines. The signs of three areas determine whether a line passes through the triangle. The
-signs are exact, because the areas are computed with integers (`tkamb.geometry.winding.PlanGrid`).
-No line therefore passes between two triangles. A line that meets an edge exactly is moved by an
-infinitesimal distance into each of the four quadrants around it (simulation of simplicity,
-Edelsbrunner & Muecke, ACM Trans Graph 9:66 (1990), doi:10.1145/77635.77639). A place that is inside
-in any of these cases counts as inside, so that a line along a wall belongs to the body.
+Every triangle is compared with the lines that cross its bounding rectangle. The signs of three
+areas, which are exact integers (`tkamb.geometry.winding.PlanGrid`), determine whether a line passes
+through it, so that none passes between two triangles. A line that meets an edge exactly is moved by
+an infinitesimal distance into each quadrant around it (simulation of simplicity, see
+`tkamb.geometry.winding`). A place that is inside in any of these cases counts as inside, so that a
+line along a wall belongs to the body.
 
-A place is inside if more entries than exits lie below it (`tkamb.geometry.winding`). A wall between
-two touching bodies therefore does not end an interval, and a void stays empty. A line through a
-hole of the mesh has unequal numbers of entries and exits; its crossings are paired in order.
+A place is inside if more entries than exits lie below it. A wall between two touching bodies does
+not end an interval, and a void stays empty. A line through a hole of the mesh has unequal numbers
+of entries and exits; its crossings are paired in order.
 """
 
 from dataclasses import dataclass
@@ -58,7 +57,6 @@ def inside_intervals(surface: Surface, axis: int, first: Array, second: Array) -
     """Return the intervals in which lines along `axis` run inside a closed surface.
 
     Args:
-        surface: closed surface, any frame.
         axis: 0, 1 or 2, the direction of the lines.
         first: (a,) increasing coordinates (m) of the lines along axis + 1 (cyclic).
         second: (b,) increasing coordinates (m) of the lines along axis + 2 (cyclic).
@@ -111,11 +109,10 @@ def united(line: Index, lower: Array, upper: Array) -> tuple[Index, Array, Array
 def _crossings(
     surface: Surface, axis: int, first: Array, second: Array
 ) -> tuple[Index, Array, Mask, Mask]:
-    """Return the crossings of all lines with all triangles.
+    """Return line (m,), height (m,), m, `rising` and counts (4, m) of all lines' crossings.
 
-    Returns:
-        line (m,); height (m,) m; rising (m,), whether the triangle faces along the line; counts
-        (4, m), whether the line passes through the triangle when moved into each quadrant.
+    `rising`: the triangle faces along the line. Counts: whether the line passes through the
+    triangle when moved into each quadrant.
     """
     across, along = [(axis + 1) % 3, (axis + 2) % 3], axis
     flat = surface.vertices[:, across]
@@ -158,14 +155,9 @@ def _signed_areas(
 ) -> tuple[Array, NDArray[np.int8]]:
     """Return twice the signed areas (3, m), m², opposite each corner, and their signs (3, 4, m).
 
-    The second axis of the signs is the quadrant into which a point on an edge is moved.
-
-    Args:
-        faces: (m, 3) vertices of the triangle in each pair of triangle and line.
-        flat: (n, 2) m, positions of the vertices in the plane normal to the lines.
-        points: (m, 2) m, position of the line in each pair.
-        whole_flat: (n, 2) positions of the vertices as integers.
-        whole_points: (m, 2) positions of the lines as integers.
+    The second axis of the signs is the quadrant into which a point on an edge is moved. `faces` (m,
+    3) and `points` (m, 2) are triangle and line of each pair; `flat` (n, 2) are the vertices in the
+    plane normal to the lines. The last two are the same positions as integers.
     """
     area = np.empty((3, len(faces)))
     sides = np.empty((3, 4, len(faces)), np.int8)
@@ -192,14 +184,7 @@ def _signed_areas(
 
 
 def _paired(line: Index, height: Array, rising: Mask, count: int) -> tuple[Index, Array]:
-    """Return line and height of all entries and exits, sorted by line and height.
-
-    Args:
-        line: (m,) line of each crossing.
-        height: (m,) m, height of each crossing.
-        rising: (m,) whether the triangle faces along the line: the crossing is an exit.
-        count: number of lines.
-    """
+    """Return sorted line and height of all entries and exits; a `rising` crossing is an exit."""
     step = np.where(rising, -1, 1)
     closed = (np.bincount(line, step, minlength=count) == 0)[line]
     lines, heights = _distinct(line[~closed], height[~closed], rising[~closed])
@@ -232,7 +217,6 @@ def _distinct(line: Index, height: Array, rising: Mask) -> tuple[Index, Array]:
 def _repaired(
     line: Index, height: Array, odd: Mask, shape: tuple[int, int], name: str
 ) -> tuple[Index, Array]:
-    """Return the crossings; lines with an odd number of them are repaired from their neighbours."""
     if not odd.any():
         return line, height
     crossed = np.count_nonzero(np.bincount(line, minlength=odd.size))
@@ -268,11 +252,9 @@ def _around(ray: int, odd: Mask, shape: tuple[int, int]) -> list[int]:
 
 
 def _completed(crossings: Array, neighbours: list[Array]) -> Array | None:
-    """Return a line's crossings after one was added or removed; None if the neighbours differ.
+    """Return a line's crossings (n,), n odd, after one was added or removed.
 
-    Args:
-        crossings: (n,) m, heights of the line's crossings; n is odd.
-        neighbours: heights (m) of the crossings of each neighbouring line.
+    None if the `neighbours`' crossings differ; all in m.
     """
     for count in (len(crossings) + 1, len(crossings) - 1):
         fitting = [n for n in neighbours if len(n) == count]

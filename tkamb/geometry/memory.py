@@ -18,10 +18,7 @@ def peak_rss(process: int | None = None) -> float:
     """Return the largest resident memory of a process so far, MB (1e6 bytes).
 
     /proc is read where it exists, because `getrusage` includes memory of the parent process. NaN
-    for another process without an entry in /proc.
-
-    Args:
-        process: process number; by default this process.
+    for another process without an entry there. The default is this process.
     """
     with suppress(OSError):
         status = Path(f"/proc/{process or os.getpid()}/status").read_text()
@@ -37,9 +34,9 @@ def peak_rss(process: int | None = None) -> float:
 def available_memory() -> float:
     """Return the number of bytes that this process may still allocate.
 
-    It is the smallest of the machine's available memory without swapping, the rest of the control
-    group's limit (cgroup 2 or 1), and the rest of the process's limit of address space. If the
-    available memory is unknown, the machine's memory replaces it. Without any value it is inf.
+    It is the smallest of the machine's available memory without swapping (if unknown, its memory),
+    the rest of the control group's limit (cgroup 2 or 1), and that of the limit of address space;
+    inf without any.
     """
     return min(_machine(), _group(), _address_space())
 
@@ -88,9 +85,9 @@ def _address_space() -> float:
 def give_back() -> None:
     """Collect reference cycles, and return freed memory to the system (with glibc).
 
-    A knee with its meshes has reference cycles. Python collects them by the number of objects, not
-    by their size. Eighteen knees one after another used 0.73 GB, but at most 0.38 GB with a
-    collection after each. In addition, glibc keeps freed memory between used blocks.
+    A knee with its meshes has reference cycles, which Python collects by number, not by size.
+    Eighteen knees in turn used 0.73 GB, but 0.38 GB with a collection after each. glibc keeps freed
+    memory between used blocks.
     """
     gc.collect()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)

@@ -1,10 +1,9 @@
 """Nearest points of a triangulated surface, its tree of bounding boxes, and surface samples.
 
 The tree divides the triangles at the median along the longest side of their box, until a leaf
-contains a few triangles. All leaves are at the same depth, so the tree needs no pointers: the
-children of box i are 2i and 2i + 1, and the root is 1. A search visits the nearer child first and
-skips boxes that are farther away than the best result so far. The result does not depend on the
-order of the search. Rays (`tkamb.geometry.rays`) and first touch (`tkamb.geometry.first_touch`)
+contains a few. All leaves are at one depth: the children of box i are 2i and 2i + 1, the root is 1.
+A search visits the nearer child first and skips boxes farther away than the best result so far; its
+result does not depend on the order. `tkamb.geometry.rays` and `tkamb.geometry.first_touch`
 search the same tree.
 """
 
@@ -30,11 +29,7 @@ MARGIN = 1e-7
 
 
 def rows(vectors: ArrayLike) -> Array:
-    """Return vectors (n, 3), or one vector (3,), as an array (n, 3) for the compiled loops.
-
-    It is contiguous, writable and in double precision, because the loops are compiled for this type
-    only.
-    """
+    """Return vectors (n, 3) or (3,) as (n, 3), contiguous, writable, double: the compiled type."""
     return np.require(vectors, np.float64, ["C", "W", "E"]).reshape(-1, 3)
 
 
@@ -42,7 +37,6 @@ class TriangleTree:
     """The tree of one surface, in the surface's frame.
 
     Args:
-        surface: open or closed surface.
         chosen: (m,) triangles of the tree; None for all triangles.
 
     Attributes:
@@ -109,12 +103,10 @@ def _halved(centres: Array) -> Index:
 
 @compiled_as_written
 def _halve(centres: Array, order: Index, leaves: int) -> None:
-    """Sort triangles into leaves; each part is divided along the longest side of its box.
+    """Sort triangle numbers `order` (m,) in place into leaves, halving along the longest side.
 
-    Args:
-        centres: (n, 3) m, centres of the triangles' boxes.
-        order: (m,) triangle numbers, sorted in place; m is a multiple of `leaves`.
-        leaves: number of leaves, a power of two.
+    `leaves` is a power of two and divides m. `centres` (n, 3), m, are those of the triangles'
+    boxes.
     """
     parts = 1
     while parts < leaves:
@@ -133,16 +125,7 @@ def _halve(centres: Array, order: Index, leaves: int) -> None:
 
 @compiled_as_written
 def _part(centres: Array, order: Index, axis: int, first: int, last: int, middle: int) -> None:
-    """Move the smaller values of a part before its middle, the larger ones behind (Hoare 1961).
-
-    Args:
-        centres: (n, 3) m, centres of the triangles' boxes.
-        order: (m,) triangle numbers, changed in place.
-        axis: 0, 1 or 2, axis of the compared coordinate.
-        first: index of the part's first item in `order`.
-        last: index of the part's last item.
-        middle: index at which the part is divided.
-    """
+    """Move smaller values along `axis` in order[first : last + 1] before `middle` (Hoare 1961)."""
     while first < last:
         pivot = centres[order[(first + last) // 2], axis]
         low, high = first, last
@@ -181,7 +164,6 @@ class Nearest:
         distance: (n,) m, between each given point and its nearest point.
         faces: (n,) triangle on which the nearest point lies.
         weights: (n, 3) barycentric coordinates of the nearest point.
-        surface: search object of the surface.
     """
 
     distance: Array
@@ -201,11 +183,7 @@ class Nearest:
 
 
 class NearestPoints:
-    """Exact search for the nearest points of one surface.
-
-    Args:
-        tree: tree of the surface; None: it is built.
-    """
+    """Exact search for the nearest points of one surface; without a tree it is built."""
 
     def __init__(self, surface: "Surface", tree: TriangleTree | None = None) -> None:
         self.surface = surface
@@ -220,12 +198,7 @@ class NearestPoints:
         return self._search(points, np.inf)
 
     def within(self, points: Array, reach: float) -> tuple[Index, Nearest]:
-        """Return the numbers of the points within `reach` (m) of the surface, and their `Nearest`.
-
-        Args:
-            points: (n, 3) m, in the surface's frame.
-            reach: m, largest distance.
-        """
+        """Return the numbers of the points (n, 3) within `reach` (m), and their `Nearest`."""
         nearest = self._search(points, reach)
         near = np.flatnonzero(nearest.faces >= 0)
         return near, Nearest(
@@ -239,9 +212,8 @@ class NearestPoints:
 def sampled(surface: "Surface", spacing: float) -> tuple[Array, Index, Array]:
     """Return samples (n, 3) of a surface, and the triangle (n,) and area (n,) of each sample.
 
-    A triangle is divided into similar triangles with edges of at most `spacing` (m). The samples
-    are their centres. The spacing is increased if the surface needs more than
-    `MAX_SAMPLES` samples.
+    They are centres of similar parts of a triangle with edges of at most `spacing` (m). The spacing
+    is increased if there are more than `MAX_SAMPLES`.
     """
     triangles = surface.triangles
     longest = surface.longest_edges
@@ -270,7 +242,6 @@ def _centres(n: int) -> Array:
 
 @compiled_as_written
 def _apart(box: Array, point: Array) -> float:
-    """Return the squared distance of a point from a box, m²."""
     total = 0.0
     for axis in range(3):
         beside = max(box[axis] - point[axis], point[axis] - box[axis + 3], 0.0)
@@ -288,13 +259,8 @@ def _on_edge(along: float, length: float) -> float:
 def _foot(corners: Array, point: Array) -> tuple[float, float, float]:
     """Return the squared distance (m²) of a triangle's nearest point and its barycentrics 2 and 3.
 
-    The nearest point is the projection onto the triangle's plane if it lies inside the triangle,
-    else the nearest projection onto an edge. Without absolute tolerances the result is correct for
-    triangles of any size.
-
-    Args:
-        corners: (9,) m, the triangle's corners.
-        point: (3,) m.
+    It is the projection onto the plane if inside, else the nearest one onto an edge. Without
+    absolute tolerances the result is correct for triangles of any size.
     """
     ux, uy, uz = corners[3] - corners[0], corners[4] - corners[1], corners[5] - corners[2]
     vx, vy, vz = corners[6] - corners[0], corners[7] - corners[1], corners[8] - corners[2]
@@ -335,24 +301,11 @@ def _nearest_place(
     stack: Index,
     squares: Array,
 ) -> tuple[int, float, float, float]:
-    """Return the triangle nearest to a point, and the point on it.
+    """Return place in `faces`, squared distance (m²) and barycentrics 2 and 3 of the nearest point.
 
-    Of several equally near triangles the result is the one with the lowest number.
-
-    Args:
-        boxes: (2 p, 6) m, see `TriangleTree`.
-        faces: (p c,) triangles of the leaves.
-        corners: (p c, 9) m, corners of these triangles.
-        point: (3,) m.
-        reach: m, largest distance of the search.
-        guess: position in `faces` of a triangle that is probably near, which saves time; -1 for
-            none.
-        stack: (`DEEPEST`,) work array, boxes on the stack.
-        squares: (`DEEPEST`,) work array, squared distances of these boxes (m²).
-
-    Returns:
-        Position in `faces`, -1 if none is within reach; squared distance (m²); barycentrics 2 and 3
-        of the nearest point.
+    Of equally near triangles it is the one with the lowest number; -1 if none is within `reach`
+    (m). Boxes, faces and corners: see `TriangleTree`. `guess` is the place of a triangle that is
+    probably near, which saves time, or -1; `stack` and `squares` (`DEEPEST`,) are work arrays.
     """
     leaves, place, size = len(boxes) // 2, NO_TRIANGLE, 1
     leaf_size = len(faces) // leaves
@@ -391,11 +344,9 @@ def _nearest_place(
 def _nearest_points(
     boxes: Array, faces: Index, corners: Array, points: Array, reach: float
 ) -> tuple[Array, Index, Array]:
-    """Return the nearest points of many points (n, 3), m; arguments as in `_nearest_place`.
+    """Return distance (n,), m, triangle (n,) and barycentrics (n, 3) of the nearest points.
 
-    Returns:
-        Distance (n,), m, triangle (n,) and barycentrics (n, 3). They are inf, -1 and NaN if no
-        triangle is within reach or the point is not finite.
+    They are inf, -1 and NaN beyond reach and for points that are not finite.
     """
     count = len(points)
     distance, face = np.full(count, np.inf), np.full(count, NO_TRIANGLE)

@@ -165,10 +165,7 @@ def triangulated(vertices: Array, corners: Index, ends: Index) -> Index:
 def ears(vertices: Array, ring: Index, normal: Array) -> Index:
     """Return a polygon as triangles (m - 2, 3); ears are cut off one by one.
 
-    Args:
-        vertices: (n, 3) positions.
-        ring: (m,) vertices of the polygon, in order.
-        normal: (3,) normal of the polygon; its length is twice the polygon's area.
+    `normal` (3,) of the polygon (m,) is twice its area long.
     """
     axis = int(np.argmax(np.abs(normal)))
     plane = [(axis + 1) % 3, (axis + 2) % 3]
@@ -204,12 +201,8 @@ def _is_ear(
 ) -> bool:
     """Return whether a corner is an ear: it is convex, and its triangle contains no other corner.
 
-    Args:
-        points: (m, 2) all corners.
-        remaining: numbers of the corners that are not cut off.
-        ear: numbers of the corner's predecessor, the corner itself and its successor.
-        least: twice the area below which a triangle counts as a line.
-        flat: whether a corner on the line between its neighbours counts as an ear, too.
+    `ear` are predecessor, corner and successor, `remaining` the corners not cut off. Below `least`
+    twice the area a triangle counts as a line, and with `flat` a corner on a line as an ear.
     """
     a, b, c = points[list(ear)]
     area = _twice_area(a, b, c)
@@ -226,5 +219,4 @@ def _is_ear(
 
 
 def _twice_area(a: Array, b: Array, c: Array) -> Array:
-    """Return twice the signed area of the triangles of a, b (2,) and c (2,) or (n, 2)."""
     return (b[0] - a[0]) * (c[..., 1] - a[1]) - (b[1] - a[1]) * (c[..., 0] - a[0])

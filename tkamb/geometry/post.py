@@ -1,8 +1,8 @@
 """The post of an insert: its search, and its separation from the dishes.
 
 In a posterior-stabilised insert a cam of the femoral component pushes against the post from behind.
-Contact models that press along y do not include this contact. `divide_insert` therefore divides the
-insert into two bodies: the dishes for the condyles, and the post for the cam.
+Contact models that press along y do not include this. `divide_insert` therefore divides the insert
+into the dishes for the condyles and the post for the cam.
 """
 
 from dataclasses import dataclass
@@ -125,13 +125,9 @@ def find_post(insert: Surface) -> Post | None:
 def divide_insert(insert: Surface) -> tuple[Surface, Surface]:
     """Return the insert without its post, and the post, both closed, insert frame.
 
-    A horizontal plane just above the surroundings separates them: the post is above it, the dishes
-    are below. In front the post is cut at a plane x = const, and the material in front of the plane
-    is removed. This plane is the fixed bottom of the cam-post contact.
-
-    Args:
-        insert: closed, insert frame.
-
+    A horizontal plane just above the surroundings separates them. In front the post is cut at a
+    plane x = const, the fixed bottom of the cam-post contact; the material in front of it is
+    removed.
     Raises:
         InputError: there is no post, or it cannot be divided.
     """
@@ -171,14 +167,8 @@ def split_faces(
 ) -> tuple[Array, Index, Index]:
     """Return all vertices, and the faces below and above a plane.
 
-    Triangles that the plane crosses are divided. The new vertices on the plane lie on edges of the
-    mesh and are shared by faces below and above.
-
-    Args:
-        vertices: (n, 3) m, no two at the same place.
-        faces: (k, 3) vertices of the triangles.
-        axis: 0, 1 or 2: the axis along the plane's normal.
-        level: m, coordinate of the plane, which is moved off the vertices (`CUT`).
+    The plane crosses `axis` at `level` (m), moved off the vertices (`CUT`). Crossed triangles are
+    divided; their new vertices are shared. No two `vertices` (n, 3), m, are at the same place.
     """
     height = vertices[:, axis] - level
     while (np.abs(height) < VERTEX_CLEARANCE).any():
@@ -208,11 +198,7 @@ def split_faces(
 def closed_by_fans(vertices: Array, faces: Index, name: str) -> tuple[Array, Index]:
     """Return vertices and faces of the surface; a fan of triangles closes every hole.
 
-    Args:
-        vertices: (n, 3) m.
-        faces: (k, 3) vertices of the triangles; each hole is plane.
-        name: name of the part in a message.
-
+    The holes are plane; `name` of the part is for a message.
     Raises:
         InputError: a fan about a hole's centre would overlap itself.
     """
@@ -238,12 +224,11 @@ def closed_by_fans(vertices: Array, faces: Index, name: str) -> tuple[Array, Ind
 
 
 def _loops(edges: Index, count: int) -> Index:
-    """Return the number of the loop that each edge (m,) belongs to."""
     graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), (count, count))
     return np.asarray(connected_components(graph, directed=False)[1][edges[:, 0]], np.int64)
 
 
 def merged(vertices: Array, faces: Index) -> tuple[Array, Index]:
-    """Return vertices and faces of the surface; vertices at the same place are merged."""
+    """Return the surface with vertices at the same place merged."""
     places, number = np.unique(vertices, axis=0, return_inverse=True)
     return places, number.reshape(-1)[faces].astype(np.int64)

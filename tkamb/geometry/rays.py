@@ -46,13 +46,8 @@ TOUCHING_DISTANCE = 1e-6
 class RayCaster:
     """Crossings of rays with one surface.
 
-    No ray passes between two triangles. A ray that touches an edge or a vertex of the outline may
-    cross the surface or not. The error of a distance is about 1e-16 m divided by the sine of the
-    angle to the surface.
-
-    Args:
-        surface: the surface; rays are given in its frame.
-        tree: tree of the surface; None: it is built.
+    No ray passes between two triangles; one that touches the outline may cross or not. The error of
+    a distance is about 1e-16 m divided by the sine of the angle to the surface.
 
     Attributes:
         tree: boxes (2 p, 6), m, and triangles (p c,) of the leaves, see `TriangleTree`; planes
@@ -89,9 +84,7 @@ class RayCaster:
         same place, and into a closed void, which has a shell of its own. An exit into an undercut
         counts, although the ray enters the body again behind it.
 
-        Args:
-            origins: (n, 3) m.
-            directions: (n, 3) or (3,), any length but zero.
+        Arguments as in `first`.
         """
         origins, directions = _rays(origins, directions)
         ray, along, face = self.all(origins, directions)
@@ -123,17 +116,13 @@ class RayCaster:
         return last
 
     def _shells(self) -> Index:
-        """Return which connected shell each face (k,) belongs to."""
         _, merged = np.unique(np.round(self.surface.vertices, 9), axis=0, return_inverse=True)
         return connected_parts(np.asarray(merged).reshape(-1)[self.surface.faces])
 
     def first_in_face(
         self, origins: ArrayLike, directions: ArrayLike
     ) -> tuple[Array, Index, Array]:
-        """Return the result of `first`, and the barycentric coordinates (n, 3) of the crossings.
-
-        The coordinates are NaN without a crossing.
-        """
+        """Return the result of `first`, and barycentrics (n, 3), NaN without a crossing."""
         origins, directions = _rays(origins, directions)
 
         def crossings(part: slice) -> tuple[Array, Index, Array]:
@@ -171,7 +160,7 @@ class RayCaster:
     def _merged(
         self, ray: Index, t: Array, face: Index, directions: Array
     ) -> tuple[Index, Array, Index]:
-        """Return the sorted crossings without duplicates, which have the same place and facing."""
+        """Return the sorted crossings, one for those of the same place and facing."""
         along = directions[ray] if len(directions) > 1 else directions
         entering = (along * self.surface.face_normals[face]).sum(axis=1) < 0.0
         order = np.lexsort((face, t, entering, ray))
@@ -194,15 +183,10 @@ def _rays(origins: ArrayLike, directions: ArrayLike) -> tuple[Array, Array]:
 
 @compiled_as_written
 def _crossing(plane: Array, origin: Array, direction: Array) -> tuple[float, float, float]:
-    """Return the distance at which a ray meets a triangle's plane, and its barycentrics 2 and 3.
+    """Return the distance (m) of a ray to a triangle's plane, and barycentrics 2 and 3.
 
-    Args:
-        plane: (12,) first corner, unit normal and `Surface.barycentric_rows`.
-        origin: (3,) m.
-        direction: (3,) unit.
-
-    Returns:
-        Distance (m), inf if the ray is parallel to the plane or the triangle has no area.
+    `plane` (12,): first corner, unit normal and `Surface.barycentric_rows`. The distance is inf if
+    the ray is parallel to the plane or the triangle has no area.
     """
     x, y, z = origin[0] - plane[0], origin[1] - plane[1], origin[2] - plane[2]
     slope = direction[0] * plane[3] + direction[1] * plane[4] + direction[2] * plane[5]
@@ -217,12 +201,9 @@ def _crossing(plane: Array, origin: Array, direction: Array) -> tuple[float, flo
 
 @compiled_as_written
 def _entry(box: Array, origin: Array, slowness: Array) -> float:
-    """Return the distance (m) at which a ray enters a box; inf without a crossing.
+    """Return the distance (m) at which a ray enters a box (6,); inf without a crossing.
 
-    Args:
-        box: (6,) m.
-        origin: (3,) m.
-        slowness: (3,) inverse components of the unit direction.
+    `slowness` (3,): inverse components of the unit direction.
     """
     enters, leaves = -np.inf, np.inf
     for axis in range(3):
@@ -256,13 +237,8 @@ def first_crossing(
     """Return the distance of a ray's first crossing, and the place of its triangle in `tree`.
 
     Of equally near triangles it is the one of the lowest number; inf and -1 without a crossing.
-
-    Args:
-        tree: see `RayCaster.tree`.
-        origin: (3,) m.
-        vector: (3,) of any length but zero.
-        guess: place of a triangle that the ray may cross, to save time; or -1.
-        work: see `ray_work`.
+    `tree`: see `RayCaster.tree`; `guess`: place of a triangle that the ray may cross, or -1;
+    `vector` (3,) has any length but zero.
     """
     boxes, faces, planes, same = tree
     direction, slowness, stack, enters = work
@@ -316,15 +292,9 @@ def ray_work() -> tuple[Array, Array, Index, Array]:
 def _first_crossings(
     tree: tuple[Array, Index, Array, float], origins: Array, directions: Array
 ) -> tuple[Array, Index, Array]:
-    """Return the first crossing of each ray; of equally near triangles the lowest number.
+    """Return distance (n,), m, triangle (n,) and barycentrics (n, 3) of each ray's first crossing.
 
-    Args:
-        tree: see `RayCaster.tree`.
-        origins: (n, 3) m.
-        directions: (n, 3) of any length, or (1, 3) for all rays.
-
-    Returns:
-        Distance (n,), m, triangle (n,) and barycentrics (n, 3); inf, -1 and NaN without a crossing.
+    inf, -1 and NaN without a crossing. `directions` (n, 3) of any length, or (1, 3) for all rays.
     """
     count, (_, faces, planes, _) = len(origins), tree
     distance, face = np.full(count, np.inf), np.full(count, NO_TRIANGLE)
@@ -348,15 +318,7 @@ def _all_crossings(
     distance: Array,
     face: Index,
 ) -> int:
-    """Return the number of all crossings, and write those that fit into the output arrays.
-
-    The other arguments are those of `_first_crossings`.
-
-    Args:
-        ray: (m,) output, ray of each crossing.
-        distance: (m,) m, output, distance of each crossing.
-        face: (m,) output, triangle of each crossing.
-    """
+    """Return the number of all crossings, and write those that fit into the output arrays (m,)."""
     boxes, faces, planes, same = tree
     leaves, number = len(boxes) // 2, 0
     leaf_size = len(faces) // leaves

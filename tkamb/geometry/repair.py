@@ -1,11 +1,10 @@
 """Repairs of a triangulated surface, with a notice of each, and removal of its inner walls.
 
-Files of CAD systems contain the wall between touching bodies. Such a wall has two sides, and a
-triangle of one side has the other body's material in front of it. If the whole wall consists of
-such triangles, it is removed. The outer surfaces of the two bodies are then joined along the rim of
-the wall: an open edge is divided at the vertices of the other surface that lie on it. If bodies
-overlap, or a triangle extends beyond the wall, the wall stays. It does not change results, because
-winding numbers (`tkamb.geometry.winding`) do not depend on walls.
+Files of CAD systems contain the two-sided wall between touching bodies: a triangle of one side has
+the other body's material in front of it. A whole wall of such triangles is removed, and the outer
+surfaces of the bodies are joined along its rim: an open edge is divided at the vertices of the
+other surface that lie on it. If bodies overlap, or a triangle extends beyond the wall, the wall
+stays. Results do not depend on it (`tkamb.geometry.winding`).
 """
 
 from collections import defaultdict
@@ -125,11 +124,7 @@ def _without_collapsed(faces: Index) -> tuple[Index, int]:
 
 
 def _without_duplicates(faces: Index) -> tuple[Index, int]:
-    """Remove duplicates of a face, and both faces of a pair with opposite winding.
-
-    Returns:
-        The remaining faces, and the number of removed faces.
-    """
+    """Remove duplicates of a face, and both of a pair with opposite winding; count the removed."""
     corners = np.sort(faces, axis=1)
     most = int(faces.max(initial=0)) + 1
     _, pair = np.unique(corners[:, 0] * most + corners[:, 1], return_inverse=True)
@@ -159,11 +154,9 @@ def _without_duplicates(faces: Index) -> tuple[Index, int]:
 def _wound(vertices: Array, faces: Index) -> tuple[Index, int, bool]:
     """Reverse faces so that neighbours have consistent winding; the smaller area is reversed.
 
-    Every face has two states, original and reversed. A graph connects consistent states of
-    neighbours. Both states of a face are in one component only on a one-sided surface.
-
-    Returns:
-        The faces, the number of reversed faces, and whether the surface is one-sided.
+    Every face has two states, original and reversed; a graph connects consistent states of
+    neighbours. Both states are in one component only on a one-sided surface. Also returns the
+    number of reversed faces, and whether the surface is one-sided.
     """
     k = len(faces)
     edge, count = edge_use(faces)
@@ -191,11 +184,7 @@ def _wound(vertices: Array, faces: Index) -> tuple[Index, int, bool]:
 
 
 def _welded(vertices: Array, faces: Index) -> tuple[Index, int]:
-    """Merge vertices of open edges within `WELD_DISTANCE` of each other.
-
-    Returns:
-        The faces, and the number of merged vertices.
-    """
+    """Merge vertices of open edges within `WELD_DISTANCE` of each other; count them."""
     loose = np.unique(open_edges(faces))
     if len(loose) == 0:
         return faces, 0
@@ -211,10 +200,9 @@ def _welded(vertices: Array, faces: Index) -> tuple[Index, int]:
 
 
 def _filled(vertices: Array, faces: Index) -> tuple[Array, Index, int, float]:
-    """Close small holes: a hole of three edges by a triangle, another hole by a fan of triangles.
+    """Close small holes: one of three edges by a triangle, another by a fan of triangles.
 
-    Returns:
-        Vertices, faces, number of closed holes, and the largest width (m) of these holes.
+    Also returns number and largest width (m) of the closed holes.
     """
     new_vertices, new_faces = [vertices], [faces]
     widest, total, filled = 0.0, len(vertices), 0
@@ -234,11 +222,7 @@ def _filled(vertices: Array, faces: Index) -> tuple[Array, Index, int, float]:
 
 
 def _outward(vertices: Array, faces: Index) -> tuple[Index, int]:
-    """Reverse the faces of inside-out bodies, but not those of a void within another body.
-
-    Returns:
-        The faces, and the number of reversed faces.
-    """
+    """Reverse and count the faces of inside-out bodies, but not those of a void in another body."""
     part = connected_parts(faces)
     volume = np.bincount(part, signed_volumes(vertices, faces))
     if (volume >= 0).all():
@@ -269,7 +253,6 @@ def _referenced(vertices: Array, faces: Index) -> tuple[Array, Index]:
 
 
 def _used(vertices: Array, faces: Index) -> Mask:
-    """Return whether each vertex (n,) belongs to a face."""
     used = np.zeros(len(vertices), bool)
     used[faces] = True
     return used
@@ -327,11 +310,7 @@ def find_inner_wall(vertices: Array, faces: Index) -> InnerWall | None:
     """Return all walls inside a closed surface as one `InnerWall`; None if there are none.
 
     If a whole body lies within another one, the result is None, too: the inner body may be a void
-    with wrong winding.
-
-    Args:
-        vertices: (n, 3) m.
-        faces: (k, 3) vertices of the triangles, wound outward.
+    with wrong winding. The faces (k, 3) are wound outward.
     """
     surface = Surface(vertices, faces, merged=True)
     inner_faces = facing_material(surface, np.arange(len(faces)))
@@ -352,14 +331,7 @@ def find_inner_wall(vertices: Array, faces: Index) -> InnerWall | None:
 
 
 def touching_groups(vertices: Array, bodies: list[Index], faces: Index, wall: Index) -> int:
-    """Return the number of groups of touching or overlapping bodies.
-
-    Args:
-        vertices: (n, 3) m.
-        bodies: triangles of each body.
-        faces: (k, 3) vertices of the triangles.
-        wall: (m,) triangles of the inner walls.
-    """
+    """Return the number of groups of touching or overlapping bodies; `wall` are inner walls."""
     group = list(range(len(bodies)))
     skins = [Surface(vertices, faces[body], merged=True) for body in bodies]
     for a, body in enumerate(bodies):
@@ -403,13 +375,7 @@ def _joined_along_rims(vertices: Array, faces: Index) -> Index:
 
 
 def _divided(vertices: Array, faces: Index, dividing: dict[tuple[int, int], Index]) -> Index:
-    """Return the triangles after vertices were inserted into some of their directed edges.
-
-    Args:
-        vertices: (n, 3) m.
-        faces: (k, 3) vertices of the triangles.
-        dividing: directed edge -> vertices to insert, in order.
-    """
+    """Return the triangles after insertion of vertices, in order, into directed edges."""
     by_face: dict[int, list[int]] = defaultdict(list)
     starts = {start for start, _ in dividing}
     for face in np.flatnonzero(np.isin(faces, list(starts)).any(axis=1)):

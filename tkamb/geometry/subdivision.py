@@ -1,7 +1,7 @@
 """The coarser triangles of a mesh that is a flat subdivision.
 
-Some meshes are flat subdivisions: every edge of a coarser mesh was halved without a change of
-shape. Then only the coarser triangles show the curvature. `coarsened` finds them.
+In a flat subdivision every edge of a coarser mesh was halved without a change of shape. Only the
+coarser triangles then show the curvature.
 """
 
 from dataclasses import dataclass
@@ -42,11 +42,8 @@ class Coarsened:
 def coarsened(vertices: Array, faces: Index) -> Coarsened | None:
     """Return the coarsest triangles that subdivide flatly into these; None if there are none.
 
-    Each connected part is examined separately. Its subdivision is undone as a whole or not at all.
-
-    Args:
-        vertices: (n, 3) m.
-        faces: (k, 3) vertices of the triangles; neighbours share theirs.
+    Each connected part is examined separately; its subdivision is undone as a whole or not at all.
+    Neighbours share vertices.
     """
     coarse: Coarsened | None = None
     for _ in range(MOST_LEVELS):
@@ -88,9 +85,8 @@ def _coarsened_once(vertices: Array, faces: Index) -> Coarsened | None:
 class _Search:
     """Search for the middle triangles of coarser triangles that were divided into four.
 
-    The corners of a middle triangle halve the edges between the tips of its three neighbours; a tip
-    is a corner of the coarser triangle. The search begins at one middle triangle and finds the next
-    ones across the neighbours' tips.
+    The corners of a middle triangle halve the edges between the tips of its neighbours, the corners
+    of the coarser triangle. The search spreads from one middle triangle across these tips.
     """
 
     def __init__(self, vertices: Array, faces: Index, across: Index) -> None:
@@ -164,7 +160,6 @@ def _across(faces: Index) -> Index:
 
 
 def _parts(across: Index) -> tuple[int, Index]:
-    """Return the number of parts that are connected across edges, and each face's part (k,)."""
     face, corner = np.nonzero(across >= 0)
     ones = np.ones(len(face), np.int8)
     graph = coo_array((ones, (face, across[face, corner])), shape=(len(across),) * 2)

@@ -40,8 +40,7 @@ NO_TURN = 1e-3
 class Surface:
     """A triangulated surface; the right-hand rule gives the outward normals.
 
-    Trees, ray casters, normals and other derived objects are computed at their first use and stored
-    with the surface.
+    Trees, normals and other derived objects are computed at first use and stored.
 
     Args:
         vertices: (n, 3) m.
@@ -161,9 +160,9 @@ class Surface:
     def smooth_normals(self, points: Array, faces: Index) -> Array:
         """Return unit normals (n, 3) at points (n, 3), m, on triangles `faces` (n,).
 
-        They are interpolated between angle-weighted normals at the corners. Triangles beyond a
-        crease of 30 deg do not count, so that a box has its face normals. On a faceted sphere the
-        normals are radial to second order.
+        They are interpolated between angle-weighted corner normals. Triangles beyond a crease of 30
+        deg do not count, so that a box has its face normals. On a faceted sphere they are radial to
+        second order.
         """
         weights = self.barycentric(points, faces)
         return _mean_normals(weights, self._smooth_corner_normals[faces])
@@ -216,10 +215,7 @@ class Surface:
 
     @cached_property
     def defects(self) -> "tuple[Defect, ...]":
-        """The openings, spikes, noise and steps of the surface.
-
-        A surface that was `remade` has those of its original.
-        """
+        """The openings, spikes, noise and steps of the surface, or of what it was `remade` from."""
         from tkamb.geometry.defects import defects_of
 
         if self._original is None:
@@ -236,8 +232,8 @@ class Surface:
         """Return the sag, m, of the facets' middles below the smooth surface.
 
         Facets of width w that meet at an angle t are chords of a circle of radius w/t, with a sag
-        of w t/8. The sags of two directions add up: the result is twice the mean over the edges.
-        Edges of more than 30 deg, and those between coplanar facets, do not count.
+        of w t/8. Sags of two directions add up: the result is twice the mean over edges of at most
+        30 deg, without those between coplanar facets.
 
         Args:
             near: (n, 3) m, points; only edges near one of them count. None: all edges.
@@ -301,10 +297,7 @@ class Surface:
         return remade
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the fields and the defects without other derived objects.
-
-        The others are larger and can be computed again.
-        """
+        """Return the fields and the defects; others are larger and computed again."""
         state = {field.name: getattr(self, field.name) for field in fields(self)}
         known = {} if "defects" not in self.__dict__ else {"defects": self.defects}
         return state | known
@@ -313,12 +306,11 @@ class Surface:
 def corner_normals(surface: Surface, crease: float, weights: Array) -> Array:
     """Return unit normals (k, 3, 3), one per triangle and corner.
 
-    The normal of a triangle at a vertex is the weighted mean over triangles at this vertex. A
-    triangle counts if its normal differs by at most `crease`. A sharp edge therefore does not tilt
-    the normals beside it. A triangle without area has zero normals.
+    It is the weighted mean over triangles at the vertex whose normals differ by at most `crease`,
+    so that a sharp edge does not tilt the normals beside it. Vertices at one place count as one. A
+    triangle without area has zero normals.
 
     Args:
-        surface: the surface; vertices at the same place count as one.
         crease: rad; with `NO_CREASE` all corners at a vertex have the same normal.
         weights: (k, 3) weight of each triangle at its corners: `corner_angles`, or its area.
     """

@@ -1,8 +1,8 @@
 """A second thread, for compiled loops that release Python's interpreter lock.
 
-The environment variable TKAMB_THREADS is the number of threads of a process, 1 or 2. The default is
-2 if the process has two processors. Results do not depend on it, to the last bit, because work is
-divided in the same way for one thread or two.
+The environment variable TKAMB_THREADS is the number of threads of a process, 1 or 2; default: 2 if
+it has two processors. Results are equal to the last bit, because work is divided in the same way
+for one thread or two.
 """
 
 import os
@@ -23,13 +23,8 @@ Second = TypeVar("Second")
 def both(first: Callable[[], First], second: Callable[[], Second]) -> tuple[First, Second]:
     """Call two functions, at the same time if the second thread is free.
 
-    Args:
-        first: function that is called in this thread.
-        second: function that is independent of `first`: it neither needs results of `first` nor
-            changes its data.
-
-    Returns:
-        The results of both functions. An error of `first` is raised after `second` has ended.
+    `second` neither needs results of `first` nor changes its data; `first` runs in this thread. An
+    error of `first` is raised after `second` has ended.
     """
     busy, thread = _second()
     if threads() == 1 or not busy.acquire(blocking=False):

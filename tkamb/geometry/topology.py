@@ -50,13 +50,9 @@ def is_closed(faces: Index) -> bool:
 
 
 def same_places(points: Array) -> tuple[Index, Index]:
-    """Group points (n, 3) that are equal.
+    """Return the first point of each group of equal points (g,), and the group (n,) of every point.
 
-    Points are grouped by a hash of their bits. If different points have the same hash, they are
-    sorted instead.
-
-    Returns:
-        First point of each group (g,), in order, and the group (n,) of every point.
+    Points (n, 3) are grouped by a hash of their bits, or sorted if it is not unique.
     """
     bits = np.ascontiguousarray(points + 0.0).view(np.uint64)  # -0 becomes 0
     mixed = bits * _ODD
@@ -186,12 +182,9 @@ class Body:
 def separate_bodies(vertices: Array, faces: Index) -> list[Body]:
     """Return the bodies of a surface, sorted by the area of the outer surface, largest first.
 
-    The normals of a void point into the void, so its volume is negative. A closed part is a void of
-    another closed part if its volume is negative and its bounding box lies within the other part's.
-
-    Args:
-        vertices: (n, 3), any unit.
-        faces: (k, 3) vertices of the triangles, after `tkamb.geometry.repair.repair`.
+    The normals of a void point into it, so its volume is negative. A closed part is a void of
+    another one if its volume is negative and its bounding box lies within the other's. The faces
+    are repaired (`tkamb.geometry.repair.repair`).
     """
     label = connected_parts(faces)
     parts = [np.flatnonzero(label == part) for part in range(int(label.max(initial=-1)) + 1)]

@@ -1,24 +1,22 @@
 """Winding numbers of points about a closed surface, which decide whether a point is inside.
 
-A vertical ray leaves a body through a triangle that faces up and enters it through one that faces
-down. The winding number of a point is the number of exits less the number of entries above it:
+The winding number of a point is the number of exits of a vertical ray less the number of entries
+above the point:
 
     w = sum of sign(n_y) over the triangles above the point
 
-The number is 1 inside a body, 0 outside and in a void, and 2 where two bodies of one file overlap.
-The two sides of a wall between touching bodies change it by -1 and +1, so the wall does not count.
-The parity of the number of crossings would be wrong for voids with wrong winding, overlaps and
-walls.
+It is 1 inside a body, 0 outside and in a void, and 2 where two bodies of one file overlap. The two
+sides of a wall between touching bodies change it by -1 and +1, so the wall does not count. The
+parity of the crossings would be wrong for voids with wrong winding, overlaps and walls.
 
-The signs of three areas in the plan view decide whether a ray passes through a triangle. Positions
-in the plan view are integers (`PlanGrid`, steps of about 1e-10 m). The areas are therefore exact,
-and the results of all triangles at an edge or a vertex are consistent. A ray that meets an edge
-exactly is moved by an infinitesimal distance to +z, and by a much smaller one to +x (simulation of
-simplicity, Edelsbrunner & Muecke, ACM Trans Graph 9:66 (1990), doi:10.1145/77635.77639). The result
-is correct for all points that do not lie on the surface.
+Positions in the plan view are integers (`PlanGrid`, steps of about 1e-10 m). The signs of the areas
+that decide whether a ray passes through a triangle are therefore exact and consistent at edges and
+vertices. A ray that meets an edge exactly is moved by an infinitesimal distance to +z, and by a
+much smaller one to +x (simulation of simplicity, Edelsbrunner & Muecke, ACM Trans Graph 9:66
+(1990), doi:10.1145/77635.77639). The result is correct for all points off the surface.
 
-In a closed surface the sum over the triangles below the point, with the opposite sign, is equal. If
-a ray leaves through a small hole of the mesh, the larger sum is the result.
+In a closed surface the sum over the triangles below, with the opposite sign, is equal. If a ray
+leaves through a small hole of the mesh, the larger sum is the result.
 """
 
 from dataclasses import dataclass
@@ -74,11 +72,8 @@ class PlanGrid:
 class WindingNumber:
     """Winding numbers of points about one surface.
 
-    The triangles are sorted into rectangular buckets of the plan view (x and z). A point is
-    compared only with the triangles in its bucket.
-
-    Args:
-        surface: closed surface with outward normals.
+    The triangles of the closed surface are sorted into rectangular buckets of the plan view (x and
+    z). A point is compared only with the triangles in its bucket.
     """
 
     def __init__(self, surface: "Surface") -> None:
@@ -121,10 +116,7 @@ class WindingNumber:
 def _sorted_into_buckets(first: Index, last: Index, count: Index) -> tuple[Index, Index]:
     """Return the starts (b + 1,) of the buckets in the list of triangles, and this list (m,).
 
-    Args:
-        first: (k, 2) lowest bucket of each triangle along x and z.
-        last: (k, 2) highest bucket of each triangle.
-        count: (2,) number of buckets along x and z.
+    `first` and `last` (k, 2) are the lowest and highest bucket of each triangle along x and z.
     """
     starts = np.zeros(count[0] * count[1] + 1, np.int64)
     for face in range(len(first)):
@@ -146,8 +138,8 @@ def _sorted_into_buckets(first: Index, last: Index, count: Index) -> tuple[Index
 def _signed_area(plan: Index, start: int, end: int, x: int, z: int) -> tuple[int, int]:
     """Return twice the signed area of the triangle of an edge and a point, and a sign.
 
-    For a point on the edge the sign is that of a point moved by an infinitesimal distance to +z,
-    and by a much smaller one to +x. It is 0 only if the edge has no length in the plan view.
+    The sign of a point on the edge is that after its move (module docstring); 0 only if the edge
+    has no length in the plan view.
     """
     du, dv = plan[end, 1] - plan[start, 1], plan[end, 0] - plan[start, 0]
     area = du * (x - plan[start, 0]) - dv * (z - plan[start, 1])
@@ -172,15 +164,8 @@ def _winding_numbers(
 ) -> Index:
     """Return the winding numbers (n,) of points, see `WindingNumber`.
 
-    Args:
-        points: (n, 3) m.
-        plan: (n, 2) x and z of the points as integers.
-        bucket: (n,) bucket of each point; -1 for a point outside all buckets.
-        starts: (b + 1,) start of each bucket's triangles in `items`.
-        items: (m,) triangles, in the order of the buckets.
-        vertices: (v, 3) m.
-        vertex_plan: (v, 2) x and z of the vertices as integers.
-        faces: (k, 3) vertices of the triangles.
+    `plan` and `vertex_plan` (·, 2) are x and z as integers; `bucket` is -1 for a point outside all;
+    `starts` (b + 1,) are the buckets' first places in the triangles `items` (m,).
     """
     result = np.zeros(len(points), np.int64)
     for n in range(len(points)):
