@@ -30,9 +30,9 @@ def covered_areas(
 
         p = C sqrt(d) inside,   gap = 4 C / (3 E*) d^(3/2) outside,   E* = E / (1 - nu²)
 
-    The two distances d add up to the length h of the side. With y = C^(-2/3) this condition is
-    p² y³ + (3 E* gap / 4)^(2/3) y = h. The area of a triangle inside the edge is divided evenly
-    among its nodes in contact.
+    The two distances add up to the length h of the side: with y = C^(-2/3), p² y³ + (3 E* gap /
+    4)^(2/3) y = h. The area of a triangle inside the edge is divided evenly among its nodes in
+    contact.
 
     Args:
         points: (n, 3) m, nodes.
@@ -83,7 +83,7 @@ def _share(
 ) -> Array:
     """Return the shares in contact (m, 2) of the two sides of each triangle that the edge cuts.
 
-    `inside` and `outside` (m, 2) are the ends of these sides in contact and out of contact.
+    `inside` and `outside` (m, 2) are these sides' ends in contact and out of contact.
     """
 
     distance = np.linalg.norm(points[inside] - points[outside], axis=2)
@@ -102,11 +102,10 @@ def _share(
 def area_above(points: Array, triangles: Index, pressure: Array, level: float) -> float:
     """Return the area (m²) where the pressure exceeds a level.
 
-    On each triangle q = p² is interpolated linearly between the corners. A constant is added: the
-    mean difference between a quadratic q and its linear interpolation. The constant is the sum over
-    the edges of (g_i - g_j).(x_j - x_i) / 24; g is the gradient of q at a corner. For a Hertzian
-    pressure, where q is quadratic, the mean of q is exact. The area is a continuous function of the
-    pressures.
+    On each triangle q = p² is interpolated linearly between the corners, plus the mean difference
+    between a quadratic q and this interpolation: the sum over the edges of (g_i - g_j).(x_j - x_i)
+    / 24, with the gradient g of q at a corner. For a Hertzian pressure, where q is quadratic, the
+    mean of q is exact. The area is continuous in the pressures.
 
     Args:
         points: (n, 3) m, nodes.
@@ -121,7 +120,6 @@ def area_above(points: Array, triangles: Index, pressure: Array, level: float) -
 
 @compiled_as_written
 def _area_above(points: Array, triangles: Index, square: Array, level: float) -> float:
-    """Return the result of `area_above`, from p² (n,) and the squared level, Pa²."""
     near, total = np.zeros(len(points), np.bool_), np.zeros((len(points), 4))
     for k in range(len(triangles)):
         a, b, c = triangles[k, 0], triangles[k, 1], triangles[k, 2]
@@ -164,10 +162,7 @@ def _area_above(points: Array, triangles: Index, square: Array, level: float) ->
 
 @compiled_as_written
 def _shape(points: Array, corners: Index, edges: Array, across: Array) -> float:
-    """Return a triangle's area; write its edges (3, 3) and the cross product of two of them.
-
-    Edge i is opposite to corner i.
-    """
+    """Return a triangle's area; write its edges (3, 3), each opposite its corner, and `across`."""
     for i in range(3):
         for axis in range(3):
             edges[i, axis] = points[corners[(i + 2) % 3], axis] - points[corners[(i + 1) % 3], axis]

@@ -1,19 +1,17 @@
 """Cam and post as a separate contact pair: the same contact model, in a turned frame.
 
-Contact models press a femoral component along -y into an insert whose flat bottom lies in
-y = 0. A cam touches the post from behind. The post is therefore turned so that its posterior face
-faces up. In the insert frame (x anterior, y superior, z to the right) the turned axes are
+A cam touches the post from behind. The post is therefore turned so that its posterior face faces
+up. In the insert frame (x anterior, y superior, z to the right) the turned axes are
 
     x' = y - y_m,    y' = x_f - x,    z' = z - z_m,
 
 where x_f is the flat front of the post (`tkamb.geometry.post.divide_insert`), and y_m and z_m are
-the middle of the post's bounding box. The posterior face
-then faces up along y'. The front is the fixed bottom of the layer, and the post's depth is the
-layer's thickness. The post does not bend at its root. The pair is evaluated at a given pose.
+the middle of the post's bounding box. The front is the fixed bottom of the layer, and the post's
+depth its thickness. The post does not bend at its root. The pair is evaluated at a given pose.
 
 R and t are rotation and translation of pose_insert_in_turned. X = [[R, t x R], [0, R]] maps a small
 displacement of the femur (translation of its point at the origin, then rotation) into the turned
-frame. Power is the same in both frames. Wrench and stiffness in the insert frame are therefore
+frame. As power is the same in both, wrench and stiffness in the insert frame are
 
     w = X^T w',    K = X^T K' X.
 """
@@ -63,11 +61,9 @@ class PostPair(ContactPair):
     def clearance(self, pose: Array) -> float:
         """Return the smallest gap (m) along y' of post and cam; NaN if no line along y' meets both.
 
-        Rays along y' on a grid over the post find the smallest gap. Two finer grids around its
-        place follow. A search over vertices would miss contact on the edges of long triangles.
-
-        Args:
-            pose: (4, 4) pose_femoral_in_turned.
+        Rays along y' on a grid over the post find it; two finer grids follow. A search over
+        vertices would miss contact on the edges of long triangles. `pose` (4, 4) is
+        pose_femoral_in_turned.
         """
         low, high = self.insert.bounds[:, [0, 2]]
         least = np.nan
@@ -129,13 +125,9 @@ class PostContact:
 
 
 class CamPost:
-    """A contact model that is prepared for a cam and a post.
+    """A contact model prepared for a cam and a post, each in its own frame.
 
-    Args:
-        femoral: femoral component with its cam, femoral frame.
-        post: closed post, insert frame, flat in front (`divide_insert`).
-        split: z (m, femoral frame) between the condyles.
-        material: material of the post.
+    The closed post is flat in front (`divide_insert`). `split` is z (m) between the condyles.
 
     Raises:
         InputError: the model cannot compute contact along a line, or there is no cam.
@@ -248,12 +240,7 @@ class PostProbe:
 
 
 class CondylesAndPost:
-    """Evaluates condyles and post of one insert at neighbouring poses, as one contact.
-
-    Args:
-        condyles: probe of the condyles.
-        post: probe of cam and post.
-    """
+    """Evaluates condyles and post of one insert at neighbouring poses, as one contact."""
 
     def __init__(self, condyles: Any, post: PostProbe) -> None:
         self._condyles, self._post = condyles, post
@@ -282,8 +269,7 @@ def _together(condyles: ProbedContact, post: ProbedContact) -> ProbedContact:
 def twist_matrix(pose: Array) -> Array:
     """Return X (6, 6), which transforms a twist (translation, then rotation) from frame A to B.
 
-    Args:
-        pose: (4, 4) pose_A_in_B.
+    `pose` is pose_A_in_B (4, 4).
     """
     turn, (x, y, z) = pose[:3, :3], pose[:3, 3]
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -293,10 +279,7 @@ def twist_matrix(pose: Array) -> Array:
 def cam_of(femoral: Surface, split: float | None, reach: float) -> Surface:
     """Return the cam: the triangles between the condyles, in the posterior half of the component.
 
-    Args:
-        femoral: femoral component, femoral frame.
-        split: z (m) between the condyles.
-        reach: m, largest distance of the cam's triangles from the split, along z.
+    `split` and `reach`, the cam's largest distance from it, are along z (m), femoral frame.
 
     Raises:
         InputError: the component has no such triangle, or only one condyle.

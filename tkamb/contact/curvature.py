@@ -60,15 +60,13 @@ def osculate(
 ) -> OsculatingContact | None:
     """Fit quadrics to both surfaces, and find the contact point where the quadrics are nearest.
 
-    The patch is a disc in the tangent plane. Evenly spaced rays along the normal sample both
-    meshes. A quadric z = c0 + c1 u + c2 v + c3 u² + c4 uv + c5 v² is fitted to each mesh by least
-    squares. Each iteration moves the disc to the minimum of the quadrics' difference, and aligns
-    its axis with the quadrics' mean normal. Facets smaller than the disc average out. On a sphere
-    of radius R the relative error of the curvature is radius²/(4 R²), from the quartic term.
+    Evenly spaced rays along the normal sample both meshes over a disc in the tangent plane. A
+    quadric z = c0 + c1 u + c2 v + c3 u² + c4 uv + c5 v² is fitted to each by least squares. Each
+    iteration moves the disc to the minimum of the quadrics' difference, and aligns its axis with
+    their mean normal. Facets smaller than the disc average out. On a sphere of radius R the
+    relative error of the curvature is radius²/(4 R²), from the quartic term.
 
     Args:
-        insert: ray caster, insert frame.
-        femoral: ray caster, femoral frame.
         pose: (4, 4) pose_femoral_in_insert close to first touch.
         start: (3,) m, place of first touch, insert frame.
         radius: m, radius of the disc.

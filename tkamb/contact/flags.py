@@ -1,10 +1,8 @@
 """Flags of contacts with an unreliable peak pressure: too narrow, or at the insert's edge.
 
-A map contains the pressure at its points only. If contact is a few points wide, the highest
-pressure lies between them, and the sum over the points is not the integral over the contact.
-
-A map does not resolve the rounding of a real edge, which also wears and chips. The flag of a
-contact at the edge states the place of the peak.
+A map contains the pressure at its points only: in a contact a few points wide, the highest pressure
+lies between them, and the sum over the points is not the integral. Nor does it resolve the rounding
+of a real edge, which also wears and chips.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -36,11 +34,8 @@ def narrow_flags(
 ) -> Iterator[str]:
     """Yield a flag for each condyle with too few inner points (see `surrounded`).
 
-    Args:
-        triangles: (k, 3) triangles of the contact surface.
-        touched: (n,) whether a point is in contact.
-        sides: side -> (n,) whether a point is under that condyle.
-        points: word for the points in the message, e.g. "cells".
+    `triangles` (k, 3) join the points; `sides` (n,) are those under each condyle; `points` is the
+    word for them in the message.
     """
     inner = surrounded(triangles, touched)
     for side, under_side in sides.items():
@@ -105,12 +100,7 @@ class ArticularEdge:
 
     @classmethod
     def of(cls, insert: Surface, settings: EdgeSettings = EDGE) -> "ArticularEdge":
-        """Return the edge of an insert: the line where it ends or turns down to its walls.
-
-        Args:
-            insert: insert, insert frame.
-            settings: definition of the edge.
-        """
+        """Return the edge of an insert: the line where it ends or turns down to its walls."""
         from scipy.ndimage import distance_transform_edt  # slow import, not needed for a report
 
         low, high = insert.bounds[:, [0, 2]]
@@ -157,12 +147,7 @@ def edge_of_insert_flags(
 ) -> Iterator[str]:
     """Yield a flag for each condyle whose contact reaches the edge of the articular surface.
 
-    Args:
-        edge: edge of the insert.
-        points: (n, 3) m, map points.
-        pressure: (n,) Pa.
-        sides: side -> (n,) whether a point is under that condyle.
-        settings: definition of a contact at the edge.
+    `sides` (n,) are the map points (n, 3), m, under each condyle.
     """
     for side, under_side in sides.items():
         side_pressure = np.where(under_side, pressure, 0.0)
@@ -210,11 +195,8 @@ def mesh_flags(
 ) -> Iterator[str]:
     """Yield a flag for each kind of defect of a mesh that the contact reaches.
 
-    Args:
-        bodies: name -> surface, and its pose (4, 4) in the insert frame.
-        points: (n, 3) m, map points.
-        area: (n,) m², their areas.
-        pressure: (n,) Pa.
+    `bodies` are surfaces with their poses (4, 4) in the insert frame. Points (n, 3), m, areas, m²,
+    and pressures, Pa, are those of a map.
     """
     loaded = pressure > 0.0
     if not loaded.any():
@@ -252,8 +234,7 @@ def unsupported_flags(
 ) -> Iterator[str]:
     """Yield a flag for each condyle with a loaded point whose column does not stand on the bottom.
 
-    A vertical ray from the point ends above the bottom there, at a pocket, a slot, a hole or an
-    overhang.
+    Such a column ends above a pocket, a slot, a hole or an overhang.
     """
     for side, under_side in sides.items():
         highest = float(pressure[under_side].max(initial=0.0))

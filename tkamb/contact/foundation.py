@@ -55,8 +55,8 @@ OVER_THE_EDGE = (
     "the femoral component reaches over the insert's edge, deeper than half of its thickness there"
 )
 WIDEST_EDGE = NEAR
-"""m: upper limit of the range of gaps in which `FoundationProbe.smoothed` counts a column partly.
-The range is the change of the gap across the column."""
+"""m: upper limit of the gaps in which `FoundationProbe.smoothed` counts a column partly: the change
+of the gap across it."""
 SUMS = 70
 """Number of sums over the columns of one condyle; see `_add_up`."""
 
@@ -66,11 +66,10 @@ class ElasticFoundation(ContactModel):
     """A layer of local thickness h bonded to a rigid plate, pressed by a rigid body.
 
     Each column of the layer is an independent spring without lateral strain and without friction.
-    The contact stores the energy sum A W(d), with dW/dd = p. Its force is the gradient of this
-    energy: with the insert's normal n, and the normal m of the femoral component where the column
-    meets it, a column loads the insert with -p A m/(m . n), at that place. p is therefore the
-    normal traction on the femoral surface, of which the column covers A/|m . n|. The femoral
-    surface is the smooth one that the mesh approximates, `CurvedSurface`.
+    The contact stores the energy sum A W(d), with dW/dd = p; its force is the gradient: with the
+    insert's normal n, and the normal m of the smooth femoral surface (`CurvedSurface`) where the
+    column meets it, a column loads the insert there with -p A m/(m . n). p is therefore the normal
+    traction on the femoral surface, of which the column covers A/|m . n|.
 
     Let d be the penetration along the insert's normal, E and nu the material's constants at zero
     strain, and sigma its uniaxial curve. With the confined modulus
@@ -82,28 +81,25 @@ class ElasticFoundation(ContactModel):
         linear:      p = M d/h
         nonlinear:   p = sigma( (M/E) * -ln(1 - d/h) )
 
-    The nonlinear law has two parts. First, the column keeps its cross-section, so the true stress
-    is p and the true strain eps is -ln(1 - d/h) (Blankevoort 1991). Second, the polyethylene
-    softens with pressure, as in Bei & Fregly (2004): p = (M/E) E_s(p) eps, with the secant modulus
-    E_s of the uniaxial curve at the stress p. Since sigma = E_s(sigma) eps, p is the curve itself
-    at (M/E) eps. A fully confined column would hardly yield, because its stress is nearly
-    hydrostatic. A contact patch of a knee, however, is only as wide as the insert is thick, so its
-    columns are not fully confined. With a linear material the law is Blankevoort's,
-    p = -M ln(1 - d/h).
+    In the nonlinear law the column keeps its cross-section, so the true stress is p and the true
+    strain eps is -ln(1 - d/h) (Blankevoort 1991). The polyethylene softens with pressure, as in Bei
+    & Fregly (2004): p = (M/E) E_s(p) eps, with the secant modulus E_s of the uniaxial curve at the
+    stress p. Since sigma = E_s(sigma) eps, p is the curve itself at (M/E) eps. A fully confined
+    column would hardly yield, but a contact patch of a knee is only as wide as the insert is thick.
+    With a linear material the law is Blankevoort's, p = -M ln(1 - d/h).
 
     Limits: neighbouring columns do not share load. The pressure therefore ends at the edge of the
-    overlap, and peaks at rims are too high. The energy depends slightly on how the map points lie,
-    whatever the facets: the map holds a ball on a plate, which nothing else holds, under the linear
-    law with 32 k d J3(k a)/(k a)³ of the load, with the penetration d, the radius a of the contact
-    and k = 2 pi/resolution. For a ball of 25 mm under 500 N this is up to 0.1 % at 1 mm and 0.4 %
-    at 2 mm. Where a column crosses an edge of two femoral triangles, its force turns: at 2 mm the
-    force of the shipped knee jumps by 0.004 N (median of 57 crossings; the largest 0.3 N), every 11
-    µm along AP. A column that meets the femur at less than 6 deg is unloaded. There, and where an
-    outline of the femoral component passes a column of the rim, the energy jumps
-    (`scripts/measure/energy`). If the penetration is at least half of the thickness, along y or
-    along the normal, the result is OUT_OF_RANGE. Walls parallel to y carry no load. A mobile
-    bearing is pressed like a fixed one. The approach counts from the first touch of the triangles;
-    the smooth surface lies outside them by up to their sagitta.
+    overlap, and peaks at rims are too high. The energy depends slightly on how the map points lie:
+    the map holds a ball on a plate, which nothing else holds, under the linear law with 32 k d J3(k
+    a)/(k a)³ of the load, with the penetration d, the radius a of the contact and k = 2
+    pi/resolution. For a ball of 25 mm under 500 N this is up to 0.1 % at 1 mm and 0.4 % at 2 mm.
+    Where a column crosses an edge of two femoral triangles, its force turns (docs/plug_in.md). A
+    column that meets the femur at less than 6 deg is unloaded. There, and where an outline of the
+    femoral component passes a column of the rim, the energy jumps (`scripts/measure/energy`). If
+    the penetration is at least half of the thickness, along y or the normal, the result is
+    OUT_OF_RANGE. Walls parallel to y carry no load. A mobile bearing is pressed like a fixed one.
+    The approach counts from the first touch of the triangles; the smooth surface lies outside them
+    by up to their sagitta.
 
     Args:
         resolution: m, spacing of the map points.
@@ -168,8 +164,8 @@ class ElasticFoundation(ContactModel):
     ) -> ContactResult:
         """Find the approach that carries `load` (N); see `ContactModel`.
 
-        The search evaluates only the columns near the femoral component. At its end all columns are
-        evaluated. If their reaction differs, the search is repeated with all columns.
+        Only near columns are evaluated. If all columns react differently at the end, the search is
+        repeated with all.
         """
         nearby = _NearColumns(self.law, state, pose, guess)
         unloaded = -state.pair.femoral.curved.sag
@@ -184,9 +180,8 @@ class ElasticFoundation(ContactModel):
     def _load_out_of_range(self, nearby: "_NearColumns", load: float) -> bool:
         """Return whether all columns together go out of range before they carry the load.
 
-        If the near columns are out of range, all columns are. The reaction rises with the approach.
-        One evaluation of all columns, at the largest approach in range, is therefore enough: it
-        gives the largest reaction in range.
+        The reaction rises with the approach, so one evaluation of all columns at the largest
+        approach in range gives the largest reaction.
         """
         if nearby.beyond - nearby.within > APPROACH_STEP:
             return False
@@ -227,8 +222,8 @@ class _NearColumns:
     def reaction(self, approach: float) -> float:
         """Return the reaction (N) at an approach (m); inf where the approach is out of range.
 
-        When `within` and `beyond` differ by at most `APPROACH_STEP`, the reaction
-        between them is that at `within`.
+        If `within` and `beyond` differ by at most `APPROACH_STEP`, it is that at `within` between
+        them.
         """
         if self.within < approach < self.beyond <= self.within + APPROACH_STEP:
             return self._last
@@ -251,10 +246,7 @@ def grazing(samples: SurfaceSamples, meeting: Meeting) -> Mask:
 def forces_on_insert(samples: SurfaceSamples, meeting: Meeting, pressure: Array) -> Array:
     """Return the forces (n, 3), N, of columns on the insert, -p A m/(m . n).
 
-    Args:
-        samples: the columns, with area A (n,) and normals n (n, 3).
-        meeting: the femoral surface that they meet, with normals m.
-        pressure: p (n,), Pa; 0 for a column that grazes the femoral surface.
+    `pressure` p (n,), Pa, is 0 for a column that grazes the femoral surface.
     """
     forces, loaded = np.zeros_like(samples.points), pressure > 0
     normals, met = samples.normals[loaded], meeting.gradient[loaded]
@@ -290,20 +282,16 @@ def layer_slope(law: Law, material: Material, strain: Array) -> Array:
 class FoundationProbe:
     """Forces and tangent stiffness of the near columns; see `tkamb.contact.model.Probe`.
 
-    A column of area A starts at the point x of the insert, along the normal n. It meets the femur
-    at the point h with the femoral normal m. Let c = m . n and M = [m; h cross m]. A displacement
-    xi = (u, w) of the femur changes the gap g by M . xi/c, so that the wrench on the insert is
+    A column of area A along the insert's normal n meets the femur at the point h with the femoral
+    normal m. Let c = m . n and M = [m; h cross m]. A displacement xi = (u, w) of the femur changes
+    the gap by M . xi/c, so that the wrench on the insert is
 
         -A p(d) M/c.
 
-    Its derivative has four terms: d changes by -M . xi/c, h moves along n by the change of g, m
-    turns by w cross m and by the femoral curvature where h slides on the femur, and c changes with
-    m. The femoral surface is that of `CurvedSurface`, whose slope jumps slightly between triangles;
-    apart from these jumps the stiffness is the exact tangent.
-
-    Args:
-        law: law of the layer.
-        state: state that the model's `prepare` returned.
+    Its derivative has four terms: d changes by -M . xi/c, h moves along n by the change of the gap,
+    m turns by w cross m and by the femoral curvature where h slides on the femur, and c changes
+    with m. Apart from the jumps of the slope of `CurvedSurface` between triangles the stiffness is
+    the exact tangent.
     """
 
     exact: ClassVar[bool] = True
@@ -358,7 +346,6 @@ class FoundationProbe:
 
     @cached_property
     def _numbers(self) -> Array | None:
-        """The numbers of `_layer`; None for another law of the material."""
         material = self._state.pair.material
         numbers = material.ramberg_osgood
         if self._law == "linear":
@@ -376,10 +363,10 @@ class FoundationProbe:
     def smoothed(self, pose: Array, contact: ProbedContact) -> ProbedContact:
         """Return the contact with its stiffness averaged over a column's width; see `Probe`.
 
-        The stiffness of a column jumps when the column comes into contact. The transverse stiffness
-        of the contact may then jump by half of its value. Here each column is weighted with the
-        share of its cell inside the edge of contact; the gap is linear across the cell. This adds
-        resolution²/6 to the square of a circular contact's radius.
+        A column's stiffness jumps when it comes into contact, the transverse stiffness of the
+        contact then by up to half. Here each column is weighted with the share of its cell inside
+        the edge of contact; the gap is linear across the cell. This adds resolution²/6 to the
+        square of a circular contact's radius.
         """
         near, meeting = self._columns(pose)
         surface, sums = self._state.surface, np.zeros((2, SUMS))
@@ -401,15 +388,10 @@ class FoundationProbe:
         return replace(contact, condyles=condyles)
 
     def loaded_points(self, pose: Array, contact: ProbedContact, slopes: bool) -> LoadedPoints:
-        """Return the pressures of the loaded columns.
+        """Return the pressures of the loaded columns; with `slopes` their derivative, too.
 
-        A displacement changes the gap of a column by M . xi/c, and so its pressure p(d/h) by
-        -p' M . xi/(c h).
-
-        Args:
-            pose: (4, 4) pose_femoral_in_insert.
-            contact: contact at that pose.
-            slopes: whether to return the derivative of the pressures.
+        A displacement changes the gap of a column by M . xi/c, and so its pressure p(d/h) by -p' M
+        . xi/(c h).
         """
         near, meeting = self._columns(pose)
         surface, state = self._state.surface, self._state
@@ -460,10 +442,7 @@ def _sum_nearby(
     split: float,
     sums: Array,
 ) -> tuple[float, Index, Array, Array, Index]:
-    """Return the largest strain, and the results of `meet_nearby`; write the sums of `_add_up`.
-
-    The first arguments are those of `meet_nearby`, the other ones those of `_add_up` and `_layer`.
-    """
+    """Return the largest strain, and the results of `meet_nearby`; write the sums of `_add_up`."""
     near, gap, gradient, patch = meet_nearby(columns, body, memory, pose, steep)
     pressure, slope, deepest = np.zeros(len(near)), np.zeros(len(near)), 0.0
     for n in range(len(near)):
@@ -514,16 +493,12 @@ def _add_up(
 
     Args:
         chosen: (m,) numbers of the columns.
-        columns: see `Columns`.
-        area: (n,) m², area of each column.
-        gap: (m,) m.
+        area: (n,) m².
         gradients: (m, 3) normals of the femoral surface where the columns meet it, of any length.
         patches: (m,) patches of the femoral surface.
         curvatures: (k, 3, 3) 1/m, of the patches: minus the derivative of `gradients` by the place
             on the femur, femoral frame.
-        pressure: (m,) Pa, of each column.
         slope: (m,) Pa, derivative of `pressure` by the strain.
-        pose: (4, 4) pose_femoral_in_insert.
         split: m, see `medial_points`.
         sums: (2, `SUMS`) output for medial and lateral: force (N), centre (3,), m, wrench (6,) on
             the insert, its stiffness (6, 6), derivatives of the centre (3, 6) and of the force (6,)
@@ -595,13 +570,8 @@ def _turn(
 ) -> None:
     """Write the derivative (6, 6) of M = [m; h x m] by a displacement of the femoral component.
 
-    Args:
-        normal: n (3,), of the column.
-        curvature: (3, 3) 1/m, see `_add_up`.
-        place: h (3,), m.
-        met: M (6,).
-        cosine: m . n.
-        change: (6, 6) output.
+    `normal` is n of the column, `curvature` (3, 3), 1/m, see `_add_up`, `place` h, `met` M (6,) and
+    `cosine` m . n.
     """
     slide, moved = np.empty(3), np.empty(3)
     for j in range(6):

@@ -120,16 +120,15 @@ class CondyleGeometry:
 class Hertz(ContactModel):
     """Elliptical Hertz contact of each condyle.
 
-    The contact point of each condyle is its first touch along -y at the given rotation, x and z.
-    Quadrics fitted there give the normal and the relative curvatures (`osculate`). Hertz's solution
-    then gives F = c delta^1.5 (`contact_ellipse`), with E* = E/(1 - nu²) of the insert; E is the
-    slope of the material's curve at the origin. Both condyles move down together. The delta of a
-    condyle is its travel beyond first touch times n_y. The tilt therefore decides how the condyles
-    share the load. Contact point and curvatures remain those of first touch.
+    The contact point of each condyle is its first touch along -y; quadrics fitted there give the
+    normal and the relative curvatures (`osculate`). Hertz's solution then gives F = c delta^1.5
+    (`contact_ellipse`), with E* = E/(1 - nu²) of the insert; E is the slope of the material's curve
+    at the origin. The delta of a condyle is its travel beyond first touch times n_y: both move down
+    together, so the tilt decides how they share the load. Contact point and curvatures remain those
+    of first touch.
 
     The map contains the semi-ellipsoid of pressure, averaged over each grid cell and scaled so that
-    its vertical force is exact. The wrench is the sum over the map. Area and peak of a condyle are
-    those of the ellipse: pi a b and p0.
+    its vertical force is exact. Area and peak of a condyle are those of the ellipse: pi a b and p0.
 
     A result is OUT_OF_RANGE if a condyle conforms to the insert (relative curvature <= 0) or its
     ellipse leaves the insert. It is flagged if the ellipse's longer semi-axis exceeds the insert's
@@ -229,9 +228,8 @@ def map_pressure(
 ) -> tuple[Array, float]:
     """Return the pressure (n,), Pa, at the samples, and the share of the force on the insert.
 
-    The pressure is averaged over sub-cells of each grid cell, and scaled so that the vertical force
-    is the patch's force times n_y. If the patch is much narrower than a cell, the nearest point
-    carries all of the force.
+    It is averaged over sub-cells and scaled so that the vertical force is the patch's force times
+    n_y. If the patch is much narrower than a cell, the nearest point carries all of it.
     """
     pressure = np.zeros(len(samples.points))
     offset = samples.points - contact.point

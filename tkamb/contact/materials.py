@@ -1,9 +1,9 @@
 """The material of the insert: one-dimensional stress-strain laws and Poisson's ratio.
 
 The laws relate true (Cauchy) stress to true (logarithmic) strain, like the measured polyethylene
-data. Tension and compression have the same curve. A small-strain model uses its engineering strain
-in the law; the two strains differ by 5 % at 10 % strain. Loading and unloading follow the same
-curve, without hysteresis or permanent set.
+data, with one curve for tension and compression, loading and unloading, without hysteresis or
+permanent set. A small-strain model uses its engineering strain in the law; the two strains differ
+by 5 % at 10 % strain.
 """
 
 from dataclasses import dataclass, field
@@ -53,8 +53,8 @@ class RambergOsgood:
     """The law of Ramberg and Osgood: eps = sigma/E + alpha (|sigma|/sigma0)^(n-1) sigma/E.
 
     Newton's method solves u + alpha u^n = E |eps| / sigma0 for u = |sigma|/sigma0 to machine
-    precision. The law is defined for every strain up to 1000; NaN gives NaN. Beyond the measured
-    strain it is an extrapolation, without a singularity at -100 %.
+    precision, for every strain up to 1000; NaN gives NaN. Beyond the measured strain it is an
+    extrapolation, without a singularity at -100 %.
 
     Args:
         alpha: yield offset, >= 0.
@@ -88,7 +88,6 @@ class RambergOsgood:
         return young_modulus / (1 + softening)
 
     def _ratio(self, strain: Array, young_modulus: float) -> Array:
-        """Return u = |sigma| / sigma0."""
         elastic = np.abs(strain) * (young_modulus / self.reference_stress)
         if self.alpha == 0:
             return elastic
@@ -118,7 +117,6 @@ def ramberg_osgood_ratio(elastic: float, alpha: float, exponent: float) -> float
 
 @compiled_as_written
 def _solve_ratio(elastic: Array, alpha: float, exponent: float, ratio: Array) -> None:
-    """Write the solutions u (n,) of `ramberg_osgood_ratio`."""
     for k in range(len(elastic)):
         ratio[k] = ramberg_osgood_ratio(elastic[k], alpha, exponent)
 
@@ -127,9 +125,8 @@ def _solve_ratio(elastic: Array, alpha: float, exponent: float, ratio: Array) ->
 class TabulatedLaw:
     """A measured true stress-strain curve, interpolated by a monotone cubic (PCHIP).
 
-    The table is mirrored through the origin. The whole curve is scaled so that its slope at the
-    origin is the given Young's modulus. Beyond the last point the curve is straight, with the slope
-    of the last chord.
+    The table is mirrored through the origin and scaled so that its slope there is the given Young's
+    modulus. Beyond the last point the curve is straight, with the slope of the last chord.
 
     Args:
         strain: strains, increasing from 0.
@@ -297,10 +294,8 @@ MATERIALS = {
 def material(name: str, **overrides: float) -> Material:
     """Return the built-in material of a name.
 
-    Args:
-        name: a key of `MATERIALS`.
-        overrides: other values of young_modulus (Pa), poisson_ratio; for "polyethylene" also
-            alpha, reference_stress (Pa), exponent.
+    `overrides` are other values of young_modulus (Pa), poisson_ratio; for "polyethylene" also
+    alpha, reference_stress (Pa), exponent.
 
     Raises:
         InputError: unknown name or override, or a value out of range.
@@ -326,11 +321,7 @@ def tabulated_material(
 ) -> Material:
     """Return a material from a true stress-strain table; see `TabulatedLaw`.
 
-    Args:
-        name: name in messages.
-        strain: strains, shape (n,).
-        stress: stresses, Pa, shape (n,).
-        poisson_ratio: Poisson's ratio.
+    `strain` and `stress` (Pa) have the shape (n,); `name` is for messages.
 
     Raises:
         InputError: the table does not rise from (0, 0).

@@ -1,10 +1,7 @@
 """The interface of every contact model (see docs/contact_model.md), and its probe.
 
 A contact model computes pressure and wrench from the pose of the femoral component in the insert.
-Its `prepare` does the work that depends on geometry and material alone. All vectors are in the
-insert frame (x anterior, y superior, z to the right), in SI units.
-
-A `Probe` evaluates many neighbouring poses for a search of equilibrium.
+All vectors are in the insert frame (x anterior, y superior, z to the right), in SI units.
 """
 
 import math
@@ -33,12 +30,11 @@ class ContactModel(ABC):
     """Base class of the contact models.
 
     A subclass is a frozen dataclass, and its fields are its options. Every model has `resolution`
-    (m), the spacing of its map points. A `guess` is an earlier result or a `WarmStart`. It saves
-    time, and changes the result by no more than the tolerance. A model stores nothing between
-    calls. `mobile_bearing` is True if the bottom of a mobile bearing slides. If it is False, the
-    model presses a mobile bearing like a fixed one, and presses and runs state this in a note.
-    `differentiable` is False if the forces jump between neighbouring poses. A derivative of the
-    forces is then refused.
+    (m), the spacing of its map points. A `guess` saves time, and changes the result by no more than
+    the tolerance. A model stores nothing between calls. `mobile_bearing` is True if the bottom of a
+    mobile bearing slides. If it is False, the model presses it like a fixed one, and presses and
+    runs state this in a note. `differentiable` is False if the forces jump between neighbouring
+    poses; their derivative is then refused.
     """
 
     name: ClassVar[str]
@@ -52,8 +48,8 @@ class ContactModel(ABC):
     def prepare(self, pair: ContactPair) -> Any:
         """Return the state of a pair: the work that depends on geometry and material alone.
 
-        By default this is the sampled surface of the insert and the first touch. A model may return
-        any subclass of `tkamb.contact.pair.PreparedContact`.
+        By default this is the sampled surface of the insert. A model may return any subclass of
+        `tkamb.contact.pair.PreparedContact`.
         """
         pair.touch_at(np.eye(4))
         return SampledContact(pair, sample_surface(pair.insert, self.resolution))
@@ -67,8 +63,8 @@ class ContactModel(ABC):
     ) -> ContactResult:
         """Return the contact at the approach along -y that carries `load` (N).
 
-        The load is the superior-inferior force on the insert. Rotation, x and z of the pose do not
-        change. This search calls `evaluate`; a model may override it with a faster one.
+        The load is the superior-inferior force on the insert; only y of the pose changes. The
+        search calls `evaluate`; a model may override it with a faster one.
         """
         return press_by_search(self, state, load, pose, guess)
 
@@ -90,10 +86,7 @@ class ContactModel(ABC):
         return result, WarmStart.after(result)
 
     def probe(self, state: Any, guess: Guess | None = None) -> Any:
-        """Return a `Probe`, which evaluates many neighbouring poses.
-
-        This probe calls `evaluate`; a model may return a faster probe with stiffness.
-        """
+        """Return a `Probe`; a model may return a faster one with stiffness."""
         return Probe(self, state, guess)
 
 
@@ -136,8 +129,8 @@ class CondyleWrench:
     def point(self) -> Array:
         """(3,) m, the point on the resultant's line of action nearest to the centre.
 
-        The nodal forces of a curved contact are not parallel, so that they have a small moment
-        about their centre of pressure. About this point the moment is parallel to the resultant.
+        Forces of a curved contact are not parallel and have a small moment about their centre of
+        pressure. About this point the moment is parallel to the resultant.
         """
         force = self.wrench[:3]
         moment = self.wrench[3:] - cross(self.centre, force)
@@ -152,9 +145,9 @@ class ProbedContact:
         condyles: side -> wrench of that condyle; an unloaded condyle is absent.
         known: False if the model is out of range or has not converged.
         tangent: True if the wrenches have a stiffness.
-        exact: True if the stiffness is the exact tangent.
+        exact: True if this is the exact tangent.
         accuracy: 1, relative error of the contact force.
-        post: wrench of a cam on the insert's post; None if the post is unloaded.
+        post: wrench of a cam on the insert's post; None if unloaded.
     """
 
     condyles: dict[str, CondyleWrench]
@@ -196,14 +189,8 @@ class LoadedPoints:
 class Probe:
     """Evaluates a contact model at neighbouring poses, each with the warm start of the last one.
 
-    Args:
-        model: any contact model.
-        state: state that the model's `prepare` returned.
-        start: earlier result or warm start for the first evaluation.
-
-    Attributes:
-        exact: True if every result contains the tangent and costs less than a press.
-        start: warm start of the next evaluation.
+    `start` is an earlier result or the warm start of the next evaluation. `exact` is True if every
+    result contains the tangent and costs less than a press.
     """
 
     exact: ClassVar[bool] = False
@@ -229,31 +216,18 @@ class Probe:
         pose: Array,
         start: Guess | None,
     ) -> tuple[ContactResult, WarmStart]:
-        """Return the contact and a warm start under a load; only the forces must be correct.
-
-        Args:
-            load: N.
-            pose: (4, 4) pose_femoral_in_insert.
-            start: result or warm start of a contact at a neighbouring pose.
-        """
+        """Return the contact and a warm start under a load (N); only the forces must be correct."""
         return self._model.press_from(self._state, load, pose, start)
 
     def smoothed(self, pose: Array, contact: ProbedContact) -> ProbedContact:
         """Return the contact with its stiffness averaged over a finite displacement.
 
         A model without an averaged stiffness returns the contact unchanged.
-
-        Args:
-            pose: (4, 4) pose_femoral_in_insert.
-            contact: contact at that pose.
         """
         return contact
 
     def exact_tangent(self, contact: ProbedContact) -> ProbedContact:
-        """Return a contact of this probe with its exact tangent.
-
-        A model without one returns the contact unchanged.
-        """
+        """Return a contact of this probe with its exact tangent, if the model has one."""
         return contact
 
     def seen(self, result: ContactResult, start: WarmStart | None = None) -> ProbedContact:
@@ -262,12 +236,7 @@ class Probe:
 
 
 def condyle_wrenches(result: ContactResult, split: float | None) -> dict[str, CondyleWrench]:
-    """Return the wrench of each loaded condyle on the insert.
-
-    Args:
-        result: a contact.
-        split: z (m, femoral frame) between the condyles; None: one condyle, medial.
-    """
+    """Return the wrench of each loaded condyle on the insert; `split` as in `ContactPair`."""
     magnitude = np.linalg.norm(result.nodal_force, axis=1)
     medial = medial_points(result.points, result.pose, split)
     wrenches = {}

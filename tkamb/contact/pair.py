@@ -78,8 +78,8 @@ class ContactPair:
     def touch_at(self, pose: Array) -> Touch | None:
         """Return the first touch of either condyle; its travel starts at y = 0.
 
-        The pose's y has no influence. The result is None if the femoral component does not lie over
-        the insert or the pose is not finite. The last eight results are cached.
+        y of the pose has no influence. None if the femoral component does not lie over the insert
+        or the pose is not finite. The last eight results are cached.
         """
         level = np.array(pose, float)
         if not np.isfinite(level).all():
@@ -88,11 +88,7 @@ class ContactPair:
         return _first_touch(self, level.tobytes())
 
     def first_touch_height(self, pose: Array) -> float:
-        """Return the y (m) of the femoral origin at which the bodies first touch.
-
-        It depends on rotation, x and z of pose_femoral_in_insert. It is NaN if the bodies do not
-        touch.
-        """
+        """Return the y (m) of the femoral origin at which the bodies first touch; NaN if never."""
         touch = self.touch_at(pose)
         return math.nan if touch is None else -touch.travel
 
@@ -104,8 +100,7 @@ class ContactPair:
     def passed_through(self, pose: Array) -> str | None:
         """Return the words for an unloaded contact that lies far beyond first touch; else None.
 
-        A model whose columns or cells lie inside or above the femoral component finds no contact
-        there.
+        A model whose columns lie inside or above the femoral component finds no contact there.
         """
         approach = self.approach(pose)
         if approach <= MAX_UNLOADED_APPROACH:
@@ -148,12 +143,7 @@ class ContactSurface:
 
 @dataclass(frozen=True, eq=False)
 class PreparedContact:
-    """The read-only state that a model's `prepare` returns; a subclass may add fields.
-
-    Args:
-        pair: the two bodies.
-        surface: points of all pressure maps of this state.
-    """
+    """The read-only state that a model's `prepare` returns; a subclass may add fields."""
 
     pair: ContactPair
     surface: ContactSurface

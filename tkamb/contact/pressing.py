@@ -1,7 +1,4 @@
-"""The press of any contact model: the search for the approach along -y that carries a load.
-
-`within_insert` checks that the bodies are not pressed through each other.
-"""
+"""The press of any contact model: the search for the approach along -y that carries a load."""
 
 import math
 from collections.abc import Callable
@@ -95,15 +92,13 @@ def press_by_search(
 ) -> ContactResult:
     """Find the approach along -y at which `model` carries `load`.
 
-    Rotation, x and z of `pose` do not change; its y is not used.
+    Only y of `pose` changes; it is not used.
 
     Args:
-        state: state that the model's `prepare` returned.
         load: superior-inferior force, N.
-        pose: (4, 4) pose_femoral_in_insert.
         guess: earlier result or warm start; its approach is the initial guess of the search.
-        reaction: function that returns the reaction (N) at an approach (m), faster than `evaluate`;
-            inf if out of range. The reaction is the force on the insert along -y.
+        reaction: the force (N) on the insert along -y at an approach (m), faster than `evaluate`;
+            inf if out of range.
         unloaded: m, see `search_load`.
 
     Returns:
@@ -133,10 +128,7 @@ def press_by_search(
 
 
 def beside_words(pair: ContactPair, pose: Array) -> str:
-    """Return that the femoral component does not lie over the insert, with the distance in x and z.
-
-    The distance is that of the two bounding boxes; it is not stated if they overlap.
-    """
+    """Return words for a component beside the insert, with the distance of the bounding boxes."""
     femur = transform(pose, pair.femoral.vertices)[:, [0, 2]]
     insert = pair.insert.vertices[:, [0, 2]]
     apart = np.maximum(insert.min(0) - femur.max(0), femur.min(0) - insert.max(0))
@@ -146,7 +138,6 @@ def beside_words(pair: ContactPair, pose: Array) -> str:
 
 
 def _carried(result: ContactResult, search: LoadSearch, load: float) -> ContactResult:
-    """Return the result with status, residual and flags of the search."""
     residual = abs(-float(result.wrench_on_insert[1]) - load) / load
     # With `not <=` a residual of NaN counts as not converged.
     diverged = not residual <= PRESS.coarse_tolerance
@@ -160,8 +151,6 @@ def _carried(result: ContactResult, search: LoadSearch, load: float) -> ContactR
 
 
 class _Evaluations:
-    """Evaluations of a model at approaches; the last result is stored."""
-
     def __init__(self, model: "ContactModel", state: Any, pose: Array, guess: Guess | None) -> None:
         self._model, self._state, self._pose, self._guess = model, state, pose, guess
         self._approach = math.nan
@@ -175,7 +164,6 @@ class _Evaluations:
         return self._last
 
     def reaction(self, approach: float) -> float:
-        """Return the reaction (N); inf where the model is out of range."""
         result = self.at(approach)
         force = -float(result.wrench_on_insert[1])
         in_range = result.status is ContactStatus.OK and math.isfinite(force)
@@ -185,14 +173,11 @@ class _Evaluations:
 def search_load(reaction: Reaction, load: float, start: float, unloaded: float = 0.0) -> LoadSearch:
     """Find the approach at which a rising reaction equals the load.
 
-    The trial approach grows from `start` until the load is bracketed. False position (Illinois)
-    then narrows the bracket.
+    The trial approach grows from `start` (m) until the load (N, positive) is bracketed. False
+    position (Illinois) then narrows the bracket.
 
     Args:
-        reaction: function that returns the reaction (N) at an approach (m): 0 at `unloaded`, inf if
-            the approach is out of range.
-        load: N, positive.
-        start: m, initial guess of the approach.
+        reaction: the reaction (N) at an approach (m): 0 at `unloaded`, inf if out of range.
         unloaded: m, an approach without reaction. It is negative for a model of smooth surfaces,
             which may overlap where the triangles first touch.
     """
@@ -257,14 +242,10 @@ def unloaded_result(model: "ContactModel", state: Any, pose: Array) -> ContactRe
 
 
 def within_insert(state: Any, result: ContactResult, *more: str) -> ContactResult:
-    """Return the result after a check that the bodies are not pressed through each other.
+    """Return the result, after a check that the bodies are not pressed through each other.
 
-    The result is OUT_OF_RANGE if the approach is at least the insert's thickness, and flagged if
-    their ratio is at least `PRESS.flagged_thickness_share`. See `compression`.
-
-    Args:
-        result: contact to be checked.
-        more: flags to be added.
+    It is OUT_OF_RANGE if the approach is at least the insert's thickness (`compression`), and
+    flagged from `PRESS.flagged_thickness_share` of it. `more` are other flags.
     """
     touch = state.pair.touch_at(result.pose)
     if touch is not None and result.approach > 0:
@@ -281,13 +262,9 @@ def within_insert(state: Any, result: ContactResult, *more: str) -> ContactResul
 def compression(pair: ContactPair, touch: Touch, result: ContactResult) -> tuple[float, str]:
     """Return the largest ratio of approach to insert thickness, and a description of its place.
 
-    At the place of first touch the undeformed bodies overlap by the whole approach. The ratio at
-    this place detects a spike of the femoral component. The ratio under each condyle's centre of
-    pressure detects a spike of the insert.
-
-    Args:
-        touch: first touch at the result's rotation, x and z.
-        result: contact with a positive approach.
+    At the place of first touch, where the undeformed bodies overlap by the whole approach, the
+    ratio detects a spike of the femoral component. Under each condyle's centre of pressure it
+    detects a spike of the insert.
     """
     condyles = {"medial": result.medial, "lateral": result.lateral}
     positions = {"where the meshes first touch": touch.point} | {
@@ -308,9 +285,9 @@ def compression(pair: ContactPair, touch: Touch, result: ContactResult) -> tuple
 def thickness_near(pair: ContactPair, positions: Array) -> Array:
     """Return the insert's thickness (n,), m, along y at positions (n, 3).
 
-    A ray from the top measures the thickness to the point where the ray first leaves the insert.
-    Near a rim the thickness is the largest one within `PRESS.rim_distance`. If no ray meets the
-    insert, the result is the height of the position above the bottom.
+    A ray from the top measures it to the point where it first leaves the insert. Near a rim it is
+    the largest within `PRESS.rim_distance`; without a ray that meets the insert, the height above
+    the bottom.
     """
     low, high = pair.insert.bounds[:, 1]
     columns = (positions[:, None] + COLUMNS).reshape(-1, 3)

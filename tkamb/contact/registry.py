@@ -25,8 +25,8 @@ USUAL = 1.0 * MILLIMETRE
 
 
 OPTION_RANGES = {"tolerance": (1e-9, 0.1), "patch_radius": (5e-4, 3e-2)}
-"""Smallest and largest value of options. A smaller tolerance is below rounding; with a larger one
-the pressures are meaningless. Patches with a radius of 0.5 to 30 mm fit on a condyle."""
+"""Smallest and largest value of options. A smaller tolerance is below rounding; a larger one makes
+pressures meaningless. Patches with a radius of 0.5 to 30 mm fit on a condyle."""
 
 BUILT_IN = {
     "hertz": "tkamb.contact.hertz:Hertz",
@@ -72,10 +72,8 @@ def contact_model(
 ) -> ContactModel:
     """Return the contact model of a name.
 
-    Args:
-        name: one of `contact_names()`.
-        resolution: spacing of the map points, m.
-        options: other options of the model, which are fields of its class (SI).
+    `resolution` is the spacing of the map points, m; `options` are other fields of the model's
+    class (SI).
 
     Raises:
         InputError: the name, an option or the value of an option is unknown; the resolution is not
@@ -105,11 +103,6 @@ def contact_model_in_mm(
 ) -> ContactModel:
     """Return the contact model of a scene or command, which states the spacing in mm.
 
-    Args:
-        name: one of `contact_names()`.
-        resolution_mm: spacing of the map points, mm.
-        options: other options of the model.
-
     Raises:
         InputError: as for `contact_model`, or the options state the resolution again.
     """
@@ -125,13 +118,11 @@ def contact_options(name: str) -> tuple[str, ...]:
 
 
 def _options(model: type[ContactModel]) -> list[str]:
-    """Return the names of a model's options without `resolution`."""
     names = [field.name for field in fields(model) if field.init]  # type: ignore[arg-type]
     return [option for option in names if option != "resolution"]
 
 
 def _allowed_values(model: type[ContactModel], option: str) -> tuple[Any, ...]:
-    """Return the allowed values of an option of type Literal; empty for another type."""
     kind = get_type_hints(model)[option]
     return get_args(kind) if get_origin(kind) is Literal else ()
 

@@ -1,8 +1,7 @@
 """The result of a contact model at one pose, and the warm start of its next evaluation.
 
-A `ContactResult` contains the pressure map, the wrench and the force of each condyle. A caller that
-presses many times uses `ContactModel.press_from`: it returns the result and a `WarmStart`, which
-the caller passes to the next press. A result may be passed instead, but saves less time.
+A caller that presses many times passes the `WarmStart` of `ContactModel.press_from` to the next
+press. A result may be passed instead, but saves less time.
 """
 
 import math
@@ -113,7 +112,6 @@ class ContactResult:
     flags: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        """Return force, area and peak of each condyle in one line."""
         sides = [
             f"{name} {condyle.force:.0f} N on {condyle.area / MILLIMETRE**2:.0f} mm², "
             f"peak {condyle.peak_pressure / MEGAPASCAL:.1f} MPa"
@@ -135,10 +133,7 @@ class ContactResult:
 
     @cached_property
     def approach(self) -> float:
-        """m, travel along -y since first touch; 0 when apart, NaN when out of range.
-
-        It is computed at its first use, from the pose and the undeformed bodies.
-        """
+        """m, travel along -y since first touch; 0 when apart, NaN when out of range."""
         if self.failed:
             return math.nan
         return self.pair.approach(self.pose)
@@ -163,12 +158,8 @@ class ContactResult:
         pressure is not finite, the result is OUT_OF_RANGE.
 
         Args:
-            state: state that `prepare` returned.
-            pose: (4, 4) pose_femoral_in_insert.
-            pressure: (n,) Pa, >= 0.
-            gap: (n,) m, positive when apart.
             nodal_force: (n, 3) N on the insert; by default pressure times area, against the normal.
-            area: (n,) m², area of each point; by default the tributary area.
+            area: (n,) m²; by default the tributary area.
             covered: (n,) m², area in contact around each point, for the condyles' areas; by default
                 `area`.
             medial: (n,) whether a point is under the medial condyle; by default `medial_points`.
@@ -238,7 +229,7 @@ class ContactResult:
     ) -> "ContactResult":
         """Return a result with the status OUT_OF_RANGE, NaN for all numbers, and the reasons.
 
-        An opening of a mesh is named, because it is a frequent reason.
+        An opening of a mesh is a frequent reason and is named.
         """
         points, pair = state.surface.points, state.pair
         openings = [
@@ -271,11 +262,8 @@ class ContactResult:
 def medial_points(points: Array, pose: Array, split: float | None) -> Mask:
     """Return whether each point (n,) lies under the medial condyle: its femoral z is below `split`.
 
-    Args:
-        points: (n, 3) m, insert frame of a right knee; left knees are mirrored at input.
-        pose: (4, 4) pose_femoral_in_insert.
-        split: z between the condyles in the femoral frame, m; None for one condyle, which is
-            medial.
+    Points are in the insert frame of a right knee (left knees are mirrored at input); `split` is in
+    the femoral frame, m; None for one condyle, which is medial.
     """
     if split is None:
         return np.ones(len(points), bool)
@@ -286,14 +274,9 @@ def medial_points(points: Array, pose: Array, split: float | None) -> Mask:
 def patch_flags(surface: ContactSurface, pressure: Array, nodal_force: Array) -> Iterator[str]:
     """Yield a flag where a component with one condyle presses on two separate patches.
 
-    A patch is a set of loaded points that the map's triangles connect. Each of the two patches
-    carries more than `LEAST_PATCH_SHARE` of the force. Their centres are more than
-    `LEAST_PATCH_DISTANCE` apart.
-
-    Args:
-        surface: the map's points and triangles.
-        pressure: (n,) Pa.
-        nodal_force: (n, 3) N.
+    A patch is a set of loaded points that the map's triangles connect. Each of the two carries more
+    than `LEAST_PATCH_SHARE` of the force, and their centres are more than `LEAST_PATCH_DISTANCE`
+    apart.
     """
     loaded = pressure > 0
     if not loaded.any():
@@ -329,8 +312,8 @@ def _summed(
 ) -> CondyleContact | None:
     """Return the contact of the chosen points, a mask (n,); None if it is empty.
 
-    The area is at least the force divided by the peak pressure. The mean pressure of a contact
-    smaller than a cell is therefore not above its peak.
+    The area is at least force / peak pressure, so that the mean pressure of a contact smaller than
+    a cell is not above its peak.
     """
     if not chosen.any():
         return None
@@ -346,8 +329,7 @@ def _summed(
 def thickness_under(position: Array, points: Array, thickness: Array) -> float:
     """Return the insert's thickness (m) under a position (3,).
 
-    The thickness is the mean over the four map points nearest in x and z, weighted with the inverse
-    distance.
+    It is the mean of the four map points nearest in x and z, weighted with the inverse distance.
     """
     square = (points[:, 0] - position[0]) ** 2 + (points[:, 2] - position[2]) ** 2
     near = np.argpartition(square, 3)[:4] if len(points) > 4 else np.arange(len(points))
@@ -370,14 +352,8 @@ def peak_flags(sides: dict[str, CondyleContact | None]) -> Iterator[str]:
 class WarmStart:
     """The initial guess that an earlier contact gives to the next one of the same state.
 
-    It saves time, and changes the result by no more than the model's tolerance.
-
-    Args:
-        pair: the two bodies.
-        pose: (4, 4) pose_femoral_in_insert of the earlier contact.
-        points: (n, 3) m, map points.
-        pressure: (n,) Pa; NaN if the contact failed.
-        gap: (n,) m, positive when apart.
+    It saves time, and changes the result by no more than the model's tolerance. Fields are those of
+    `ContactResult`; the pressure is NaN if the contact failed.
     """
 
     pair: ContactPair

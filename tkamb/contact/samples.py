@@ -62,8 +62,8 @@ class SurfaceSamples(ContactSurface):
     """Map points on the upper surface: the first crossings of rays from above, also on a post.
 
     The points lie on the mesh, and the normals are `Surface.smooth_normals`. The area of a point is
-    the covered part of its grid cell divided by n_y. The vertical force of a uniform pressure is
-    therefore exactly the pressure times the covered area in the plan view.
+    the covered part of its grid cell divided by n_y, so that the vertical force of a uniform
+    pressure is exactly the pressure times the covered area in the plan view.
 
     Args:
         depth: (n,) m, distance along the inward normal to the end of the insert.
@@ -89,14 +89,12 @@ class SampledContact(PreparedContact):
 def sample_surface(insert: Surface, resolution: float) -> SurfaceSamples:
     """Sample the upper surface of the insert by vertical rays on an x-z grid.
 
-    Each cell has one point, at its centre; at the rim it lies at the centre of the covered part.
-    The cells are symmetric about x = 0 and z = 0. A wall parallel to y has no point, because no
-    vertical ray hits it. Integrals over the points are second-order in the resolution (midpoint
-    rule). On two real implants the force at 1 mm is within 0.5 %, the peak within 2 % and the area
-    within 4 % of the values at 0.25 mm.
+    Each cell has one point, at its centre; at the rim at the centre of the covered part. The cells
+    are symmetric about x = 0 and z = 0. A wall parallel to y has no point. Integrals over the
+    points are second-order in the resolution (midpoint rule). On two real implants the force at 1
+    mm is within 0.5 %, the peak within 2 % and the area within 4 % of the values at 0.25 mm.
 
     Args:
-        insert: closed insert, insert frame.
         resolution: edge of the cells, m.
 
     Raises:
@@ -118,11 +116,10 @@ def sample_surface(insert: Surface, resolution: float) -> SurfaceSamples:
 def gaps_along_normals(samples: SurfaceSamples, femoral: Surface, pose: Array) -> Array:
     """Return the gap (n,), m, along the insert's normals; negative for a penetration.
 
-    A ray starts half-way through the insert and runs outward along the normal. Its first crossing
-    with the femoral component gives the gap. The gap is inf without a crossing, and -inf if the ray
-    starts inside the femoral component. On a steep rim the ray starts under the dish, where the
-    femoral component may be. A penetration counts there only if the surface point lies inside the
-    femoral component, too.
+    The ray to the femur starts half-way through the insert. The gap is inf without a crossing, and
+    -inf if the ray starts inside the femoral component. On a steep rim it starts under the dish,
+    where the femoral component may be; a penetration counts there only if the surface point lies
+    inside, too.
     """
     return meet(samples, femoral, pose).gap
 
@@ -184,9 +181,7 @@ def meet_columns(
         back: (4, 4) pose_insert_in_femoral.
         steep: `MapPointSettings.side_start_normal_y`.
         places: (n,) place in the tree of the triangle that each ray may meet, or -1; updated.
-        gap: (m,) output, see `Meeting`.
-        gradient: (m, 3) output.
-        patch: (m,) output.
+        gap: (m,) output like `gradient` and `patch`, see `Meeting`.
     """
     points, normals, thickness, depth = columns
     tree, face_normals, quadratics = body
@@ -228,8 +223,8 @@ def meet_columns(
 def _from_outside(distance: float, face: int, along: Array, face_normals: Array) -> float:
     """Return the distance (m) to the femur along a ray; -inf if the ray leaves it first.
 
-    A ray that leaves the femur at its first crossing starts inside the femur: the penetration is
-    deeper than the start of the column.
+    A ray that leaves the femur at its first crossing starts inside it: the penetration is deeper
+    than the start of the column.
     """
     facing = 0.0
     if distance < np.inf:
@@ -291,15 +286,14 @@ def _first(caster: RayCaster, xz: Array) -> tuple[Array, Index]:
 
 
 def _above(surface: Surface, xz: Array) -> Array:
-    """Return points (n, 3), m, above the surface at x and z (n, 2)."""
     return np.stack([xz[:, 0], np.full(len(xz), surface.bounds[1, 1] + 1e-3), xz[:, 1]], axis=1)
 
 
 def _through(caster: RayCaster, xz: Array, insert: Surface) -> tuple[Array, Index, Array]:
     """Return the first crossings (n, 3) of vertical rays, their faces (n,) and thicknesses (n,), m.
 
-    The thickness ends where the ray finally leaves the insert. An inner wall or a void does not end
-    it, because the material below transmits the load.
+    The thickness ends where the ray finally leaves the insert: below an inner wall or a void the
+    material transmits the load, too.
     """
     origins = _above(insert, xz)
     distance, face = caster.first(origins, DOWN)
@@ -318,10 +312,7 @@ def _through(caster: RayCaster, xz: Array, insert: Surface) -> tuple[Array, Inde
 
 
 def _depth(caster: RayCaster, points: Array, normals: Array, thickness: Array) -> Array:
-    """Return the depth (n,), m, of the insert along the inward normals.
-
-    A ray that meets an inner wall is continued behind it.
-    """
+    """Return the depth (n,), m, of the insert along the inward normals, through inner walls."""
     depth = np.zeros(len(points))
     active = np.arange(len(points))
     for _ in range(MAP_POINT.max_inner_walls):
@@ -368,15 +359,10 @@ none in 2,293 of them."""
 class Neighbourhood:
     """Evaluates only the columns that the femoral component may reach.
 
-    Let g be the gap of a column at its last evaluation, and m the displacement of the femoral
-    component at the column since then. The gap is now at least g - 2 m if the angle between column
-    and femoral normal is less than 60 deg. A column is skipped if this bound is above `NEAR`.
-
-    Args:
-        state: state that the model's `prepare` returned.
-
-    Attributes:
-        inputs: the first three arguments of `meet_nearby`.
+    A gap g at the last evaluation is now at least g - 2 m, with the displacement m of the femoral
+    component at the column since then, if the angle between column and femoral normal is less than
+    60 deg. A column is skipped if this bound is above `NEAR`. `inputs` are the first three
+    arguments of `meet_nearby`.
     """
 
     def __init__(self, state: SampledContact) -> None:
@@ -403,10 +389,7 @@ def meet_nearby(
 ) -> tuple[Index, Array, Array, Index]:
     """Return the columns (m,) that the femoral component may reach, and the fields of `Meeting`.
 
-    Args:
-        memory: what is known of all columns; updated.
-        pose: (4, 4) pose_femoral_in_insert.
-        steep: `MapPointSettings.side_start_normal_y`.
+    `memory`, of all columns, is updated. `steep`: see `meet_columns`.
     """
     points, (last_gap, last_position, places) = columns[0], memory
     near, number, place = np.empty(len(points), np.int64), 0, np.empty(3)

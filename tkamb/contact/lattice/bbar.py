@@ -30,8 +30,8 @@ _ROOT = (_VECTORS * np.sqrt(np.maximum(_VALUES, 0))).T[_VALUES > 1e-12]
 class BbarHexahedra(Solid):
     """Mean-dilatation hexahedra, small strain, J2 deformation theory at the Gauss points.
 
-    At each point e² = (2/3) dev eps : dev eps and 3 mu_s = q(e)/e. The bulk is elastic. See
-    `Solid` for the arguments and `ShearCurve` for q.
+    At each point e² = (2/3) dev eps : dev eps and 3 mu_s = q(e)/e. The bulk is elastic.
+    `Solid` has the arguments, `ShearCurve` q.
 
     Raises:
         InputError: the Jacobian is not positive at a Gauss point.
@@ -52,7 +52,6 @@ class BbarHexahedra(Solid):
         return self.pattern.assemble(self._linear_matrices())
 
     def _linear_matrices(self) -> Iterator[Array]:
-        """Yield the linear stiffness (k, 24, 24), N/m, of one chunk of cells after the other."""
         for chunk in chunks(len(self.cells)):
             shear = np.sqrt(self.weights[chunk])[..., None, None] * self.shear[chunk]
             flat = shear.reshape(-1, 40, 24)

@@ -1,23 +1,21 @@
 """The exact tangent of a lattice's contact: the derivative of its converged nodal forces.
 
-H(x, z) is the height of the femoral surface above the insert, and n(x, z) its normal there. An
-active node at the position X + u carries the force f = lambda n, and lies on the surface. A small
-femoral displacement changes H and n at a constant (x, z) by dH and dn, so that
+H(x, z) is the height of the femoral surface above the insert, and n(x, z) its normal. An active
+node at X + u lies on the surface and carries the force f = lambda n. A small femoral displacement
+changes H and n at a constant (x, z) by dH and dn, so that
 
     du = C df,    df = n dlambda + lambda (dn + G du),    m . du = dH,
     m = (-H_x, 1, -H_z),    G = (n_x, 0, n_z).
 
-C is the compliance of the tangent stiffness K_T at the converged displacement, of all cells, on the
-active nodes. With S = (1 - C lambda G)⁻¹ C, dlambda solves
+C is the compliance, on the active nodes, of the tangent stiffness K_T of all cells at the converged
+displacement. With S = (1 - C lambda G)⁻¹ C, dlambda solves
 
     mᵀ S n dlambda = dH - mᵀ S lambda dn.
 
 The active set is constant: where a node comes into contact, the derivative is one-sided. For a
-translation w, dH = m . w and dn = -G w. The other derivatives of H and n are central differences of
-the femoral surface.
+translation w, dH = m . w and dn = -G w; else dH and dn are central differences of the surface.
 
-`tkamb.contact.lattice.probe` has a faster approximation: C of the linear material, and nodes that
-move along the normal alone.
+`tkamb.contact.lattice.probe` has a faster approximation.
 """
 
 from dataclasses import dataclass
@@ -45,14 +43,9 @@ def exact_force_changes(
 ) -> Array:
     """Return the derivative (m, 3, 6) of nodal forces by a displacement of the femur.
 
-    Args:
-        result: contact that has converged.
-        start: its warm start.
-        nodes: loaded contact nodes, shape (m,).
-
-    Returns:
-        Columns 0 to 2: N per m of translation of the femoral point at the insert's origin.
-        Columns 3 to 5: N per rad of rotation about this point.
+    `nodes` (m,) are loaded contact nodes of a converged result; `start` is its warm start. Columns
+    0 to 2 are N per m of translation of the femoral point at the insert's origin, 3 to 5 N per rad
+    of rotation about it.
     """
     problem, count = state.problem, len(nodes)
     force = result.nodal_force[nodes]
@@ -77,7 +70,6 @@ def exact_force_changes(
 
 
 def _by_node(compliance: Array, vectors: Array) -> Array:
-    """Return the displacements (3m, m) under a force along one vector (m, 3) at each node."""
     count = len(vectors)
     return np.asarray(np.einsum("kjb,jb->kj", compliance.reshape(-1, count, 3), vectors))
 
@@ -133,7 +125,6 @@ def _surface_derivatives(
 
 
 def _central(ahead: tuple[Array, Array], behind: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Return the slopes of heights (n,) and normals (n, 3) over two `SURFACE_STEP`."""
     rise = (ahead[0][:, 1] - behind[0][:, 1]) / (2.0 * SURFACE_STEP)
     return rise, (ahead[1] - behind[1]) / (2.0 * SURFACE_STEP)
 

@@ -1,15 +1,13 @@
 """The lattice's contact at neighbouring poses, and its stiffness for an unchanged active set.
 
 A small femoral displacement v(x) = t + r cross x moves the femoral planes, and the nodes in contact
-stay on them. With the femoral normals n, the forces lambda along them, and the compliance C of the
-nodes,
+stay on them. With the femoral normals n, the forces lambda along them, and the compliance C,
 
     dF = n dlambda + lambda dn,    n . (C dF - v) = 0,    dn = r cross n - G (v - n (n . v)).
 
 G is the gradient of the femoral normal along the surface. The nodes are assumed to move along the
-normal only, so that the femur slides over them. C belongs to the linear material, and the active
-set is constant. The real contact differs in both. So the forces come from `evaluate`, and the
-stiffness only gives the direction of a search.
+normal only, with C of the linear material and a constant active set. The real contact differs, so
+the forces come from `evaluate`, and the stiffness only gives the direction of a search.
 """
 
 from dataclasses import dataclass, replace
@@ -39,11 +37,8 @@ REGION_HOLDS_TO = 1.1
 class LatticeProbe(Probe):
     """Contact forces and their stiffness at neighbouring poses; see `tkamb.contact.model.Probe`.
 
-    Args:
-        model: lattice model with contact forces along the femoral normal.
-        state: result of its `prepare`.
-        start: an earlier result or warm start.
-        accuracy: the model's tolerance, relative to the contact force.
+    `accuracy` is the model's tolerance, relative to the contact force. The model's contact forces
+    act along the femoral normal.
     """
 
     def __init__(
@@ -99,12 +94,8 @@ class LatticeProbe(Probe):
     def loaded_points(self, pose: Array, contact: ProbedContact, slopes: bool) -> LoadedPoints:
         """Return the pressures of the loaded nodes; their derivative is that of `exact_tangent.py`.
 
-        The area of a node is constant, so that its pressure changes as its force.
-
-        Args:
-            pose: (4, 4) pose_femoral_in_insert.
-            contact: contact of this probe at that pose.
-            slopes: whether to return the derivative of the pressures.
+        A node's area is constant, so that its pressure changes as its force. `contact` is one of
+        this probe.
         """
         if not contact.condyles:
             return LoadedPoints(np.empty(0), np.empty(0), np.empty(0, bool), np.empty((0, 6)))
@@ -172,14 +163,7 @@ def force_changes(
 ) -> Array:
     """Return the change (m, 3, 6) of nodal forces per small displacement of the femur.
 
-    Args:
-        result: contact that has converged.
-        displacement: displacement of all contact nodes in this contact, m, shape (c, 3).
-        nodes: loaded contact nodes, shape (m,).
-
-    Returns:
-        Columns 0 to 2: N per m of translation of the femoral point at the insert's origin.
-        Columns 3 to 5: N per rad of rotation about this point.
+    `displacement` (c, 3), m, is that of all contact nodes. Else as `exact_force_changes`.
     """
     problem = state.problem
     force = result.nodal_force[nodes]

@@ -29,12 +29,8 @@ UP = np.array([0.0, 1.0, 0.0])
 class SurfaceFromBelow:
     """The lowest femoral surface over any x and z of the insert.
 
-    A ray that meets a triangle is continued to the curved patch of this triangle
-    (`CurvedSurface`). So facets leave no pattern in the pressure.
-
-    Args:
-        surface: femoral component, femoral frame.
-        rays: its ray caster.
+    A ray that meets a triangle is continued to its curved patch (`CurvedSurface`), so that facets
+    leave no pattern in the pressure. The surface is in the femoral frame.
     """
 
     surface: Surface
@@ -47,16 +43,9 @@ class SurfaceFromBelow:
     def over(self, points: Array, pose: Array) -> tuple[Array, Array]:
         """Return the lowest femoral points (n, 3) on the verticals through points, and normals.
 
-        The rays begin below both bodies.
-
-        Args:
-            points: m, insert frame, shape (n, 3); y is not used.
-            pose: pose_femoral_in_insert, shape (4, 4).
-
-        Returns:
-            Points, m, and outward unit normals, insert frame, shape (n, 3) each; NaN where there
-            is no femoral surface. Normals are interpolated between vertices, so that they are
-            continuous on smooth parts. They point down.
+        The rays begin below both bodies. Points, m, and outward unit normals, which point down, are
+        in the insert frame; NaN where there is no femoral surface. Normals are interpolated between
+        vertices, so that they are continuous on smooth parts. y of `points` (n, 3), m, is not used.
         """
         to_femoral = inverse(pose)
         start = float(pose[1, 3]) - 2 * float(np.abs(self.surface.bounds).max()) - 1e-2
@@ -76,13 +65,10 @@ class ContactProblem:
     """A solid, its linear operator, its contact nodes and the femoral component.
 
     Args:
-        solid: cells and material.
         operator: factor of the linear stiffness.
         index: lattice index of each node, shape (n, 3).
         held: mask of the unknowns held by the boundary, shape (3n,).
-        femoral: femoral component seen from below.
-        direction: direction of the contact forces: along the femoral normal, or vertical
-            (Sharma 2008).
+        direction: of the contact forces: along the femoral normal, or vertical (Sharma 2008).
         lift: height of the smooth surface above the contact nodes, m, shape (c,), or 0.
     """
 
@@ -127,9 +113,7 @@ class ContactProblem:
 class TangentPlanes:
     """The tangent planes of the femoral surface over contact nodes, at zero approach.
 
-    Args:
-        points: femoral points on the verticals through the nodes, m, shape (m, 3).
-        normals: femoral outward unit normals at these points, shape (m, 3).
+    Points and outward unit normals (m, 3), m, lie on the verticals through the nodes.
     """
 
     points: Array
@@ -188,7 +172,6 @@ class Region:
         elements: numbers of the elements, increasing, shape (k,).
         nodes: their nodes that are not held, shape (m,).
         fronts: fronts of the factor that a solve for these nodes needs.
-        whole: whether the subset has all elements.
     """
 
     elements: Index
@@ -209,13 +192,7 @@ class Region:
 
 @dataclass(frozen=True, eq=False)
 class LatticeState(PreparedContact):
-    """A prepared contact: everything that depends on geometry and material alone.
-
-    Args:
-        lattice: the insert's grid.
-        problem: solid, factorised operator and femoral component.
-        compliance: cache of the compliance of recent candidates; it changes no result.
-    """
+    """A prepared contact. `compliance` caches that of recent candidates; it changes no result."""
 
     surface: ContactMap
     lattice: Lattice

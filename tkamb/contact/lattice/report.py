@@ -1,8 +1,8 @@
 """From a solution of the lattice to a `ContactResult`: pressures, areas and flags.
 
-Flags mark large strains, and peaks that the cells do not resolve. At a rounded edge narrower than
-the cells, the peak rises with every refinement (docs/lattice.md, "Convergence on real implants").
-In a contact too narrow for the cells, the peak is an average over an area larger than the contact.
+Flags mark large strains, and peaks that the cells do not resolve: at a rounded edge narrower than
+the cells, the peak rises with every refinement (docs/lattice.md, "Convergence on real implants");
+in a contact too narrow for the cells, it is an average over a larger area.
 """
 
 from collections.abc import Iterator, Mapping
@@ -80,15 +80,10 @@ def edge_flags(
 ) -> tuple[str, ...]:
     """Return a flag for each peak that lies at an edge of the femoral component.
 
-    The femoral normal at the peak is compared with eight normals around it, at a distance of
-    `EDGE_DISTANCE_CELLS` or `LEAST_EDGE_DISTANCE`, if that is larger. A
-    turn by more than `SHARP_EDGE_ANGLE` is an edge, and so is the end of the surface.
-
-    Args:
-        femoral: femoral component seen from below.
-        pose: pose_femoral_in_insert, shape (4, 4).
-        spacing: edges of a cell, m, shape (3,).
-        peaks: point of the peak pressure by side, m, insert frame, shape (3,) each.
+    The femoral normal at the peak is compared with eight normals around it, at
+    `EDGE_DISTANCE_CELLS` or, if larger, `LEAST_EDGE_DISTANCE`. A turn by more than
+    `SHARP_EDGE_ANGLE` or an end of the surface is an edge. `spacing` (3,), m, are the edges of a
+    cell, `peaks` points (3,), m, insert frame.
     """
     distance = np.maximum(EDGE_DISTANCE_CELLS * spacing, LEAST_EDGE_DISTANCE)
     # All eight directions have the same length.
@@ -132,9 +127,7 @@ def strain_flags(state: LatticeState, solution: Solution) -> tuple[tuple[str, ..
 def unseen_flags(state: LatticeState, result: ContactResult, depth: float) -> Iterator[str]:
     """Yield a flag if the meshes touch long before any node does.
 
-    Args:
-        result: result of a press.
-        depth: travel of the femoral component since it touched the first contact node, m.
+    `depth`, m, is the femoral travel of a press since it touched the first contact node.
     """
     unseen = result.approach - depth
     if unseen > max(MAX_UNSEEN_HEIGHT, PRESS.flagged_thickness_share * result.approach):
@@ -174,7 +167,7 @@ def result_of(
         load: N, or None if the pose was given.
         gaps: vertical gaps at that pose, m, shape (c,).
         rule: rule for the area that a nodal force acts on.
-        forces_only: whether the solution is that of the region. Then nothing is flagged.
+        forces_only: the solution is that of the region, and nothing is flagged.
     """
     # A pose that was given is final. The pose of a press is that of first touch, and the femoral
     # component moves down by the approach.
@@ -215,9 +208,7 @@ def _pressures(
 ) -> tuple[Array, Array, Array]:
     """Return nodal forces (c, 3), N, pressures (c,), Pa, and the areas (c,) that they act on, m².
 
-    Args:
-        gaps: vertical gaps of the undeformed insert at the final pose, m, shape (c,).
-        rule: rule for the areas.
+    `gaps` are those of the undeformed insert at the final pose.
     """
     force, size = np.zeros_like(state.surface.points), np.zeros(len(gaps))
     force[solution.candidates] = solution.forces.force[:, None] * solution.planes.normals
@@ -232,15 +223,10 @@ def _pressures(
 def _gaps(state: LatticeState, pose: Array, gaps: Array, force: Array, solution: Solution) -> Array:
     """Return the gaps (c,), m.
 
-    Gaps of the deformed insert are used in and beside the contact, and where the undeformed bodies
-    overlap. Elsewhere the insert is undeformed. The edge of contact depends on the gaps beside the
-    contact, but the candidates depend on the initial guess. So the gap of a node beside the contact
-    is computed even if it is no candidate.
-
-    Args:
-        pose: final pose, shape (4, 4).
-        gaps: vertical gaps of the undeformed insert at this pose, m, shape (c,).
-        force: N, shape (c, 3).
+    They are those of the deformed insert in and beside the contact, and where the undeformed bodies
+    overlap; elsewhere `gaps` of the undeformed insert at this pose. The edge of contact depends on
+    the gaps beside it, but the candidates depend on the initial guess: so a gap there is computed
+    even if the node is no candidate.
     """
     loaded: Mask = np.asarray(force.any(axis=1), bool)
     close = beside(state.surface.triangles, loaded) | loaded | (gaps < 0)
@@ -272,8 +258,7 @@ def gaps_of_others(state: LatticeState, pose: Array, nodes: Index, solution: Sol
 def _areas(state: LatticeState, gaps: Array, loaded: Mask, rule: PressureRule) -> Array:
     """Return the area (c,), m², that each node's force acts on.
 
-    By Sharma's rule, the nodes in contact have equal shares of the area where the undeformed
-    bodies overlap.
+    By Sharma's rule, the nodes in contact have equal shares of the undeformed bodies' overlap.
     """
     if rule == "tributary" or not loaded.any():
         return state.surface.area

@@ -117,11 +117,7 @@ class Pattern:
         return len(self.indptr) - 1
 
     def assemble(self, matrices: Iterable[Array]) -> sparse.csr_matrix:
-        """Return the sum (3n, 3n) of the elements' matrices.
-
-        Args:
-            matrices: matrices of consecutive groups of elements, shape (k, 3p, 3p) each.
-        """
+        """Return the sum (3n, 3n) of `matrices` (k, 3p, 3p) of consecutive groups of elements."""
         blocks, at = np.zeros((len(self.indices), 3, 3)), 0
         for group in matrices:
             _add_blocks(group, self.slot[at : at + len(group)], blocks)
@@ -145,11 +141,7 @@ def _add_blocks(matrices: Array, slot: Index, blocks: Array) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """Sums nodal vectors of elements to global ones.
-
-    Args:
-        elements: nodes of each element (cell or spring), shape (c, p).
-    """
+    """Sums nodal vectors of elements (cells or springs), (c, p) nodes, to global ones."""
 
     elements: Index
     nodes: int
@@ -160,12 +152,7 @@ class Scatter:
         return displacement[elements].reshape(len(elements), 3 * elements.shape[1])
 
     def sum(self, forces: Array, chosen: Index | None = None) -> Array:
-        """Return the nodal sums (n, 3), N, of element forces.
-
-        Args:
-            forces: forces of the chosen elements, N, shape (k, 3p).
-            chosen: numbers of these elements, shape (k,); by default all.
-        """
+        """Return the nodal sums (n, 3), N, of forces (k, 3p) of the chosen elements."""
         total = np.zeros((self.nodes, 3))
         elements = np.arange(len(self.elements)) if chosen is None else chosen
         shape = len(elements), self.elements.shape[1], 3
@@ -250,24 +237,19 @@ class Solid(ABC):
     @property
     @abstractmethod
     def stiffness(self) -> sparse.csr_matrix:
-        """Linear stiffness (3n, 3n), N/m.
-
-        Each access assembles it anew. It takes half as much memory as the factor.
-        """
+        """Linear stiffness (3n, 3n), N/m, assembled anew at each access to save memory."""
 
     @abstractmethod
     def nonlinear_residual(self, displacement: Array, chosen: Index | None = None) -> Array:
         """Return linear minus actual forces (k, 3p), N, of the elements of `scatter`.
 
-        Args:
-            displacement: m, shape (n, 3); only the chosen elements' nodes are used.
-            chosen: numbers of the elements, shape (k,); by default all.
+        Only the chosen elements' nodes of the displacement (n, 3), m, are used; by default all.
         """
 
     def forces(self, displacement: Array) -> tuple[Array, Array, float]:
         """Return the internal forces of a displacement (n, 3), m, summed element by element.
 
-        They do not use the stored factor. So its rounding does not hide the error of a solution.
+        They do not use the stored factor, whose rounding would hide the error of a solution.
 
         Returns:
             Internal forces f(u) (n, 3), N; norm of h = K u - f(u) of each element (k,), N; and
@@ -303,9 +285,8 @@ class Solid(ABC):
     def least_principal_strain(self, displacement: Array) -> float:
         """Return the smallest principal strain of the mean strains of all cells.
 
-        The size of a principal strain is at most the norm of the strain tensor. So the cell with
-        the largest norm is evaluated first. Cells whose norm is below the largest compression of
-        this cell cannot have a smaller principal strain and are skipped.
+        Its size is at most the norm of the strain tensor: the cell with the largest norm is
+        evaluated first, and cells whose norm is below its compression are skipped.
         """
         strain = self.strain(displacement)
         norms = np.sqrt(np.einsum("kab,kab->k", strain, strain))
@@ -315,10 +296,7 @@ class Solid(ABC):
         return float(np.linalg.eigvalsh(strain[evaluated]).min())
 
     def bulk(self, cells: slice) -> Array:
-        """Return the volumetric stiffness K V g gᵀ (k, 24, 24), N/m, of cells.
-
-        g · u is the mean dilatation.
-        """
+        """Return the volumetric stiffness K V g gᵀ (k, 24, 24), N/m; g · u: mean dilatation."""
         g = self.gradients[cells].reshape(-1, 24)
         scale = self.material.bulk_modulus * self.volume[cells]
         return (scale[:, None] * g)[:, :, None] * g[:, None, :]

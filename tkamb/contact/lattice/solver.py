@@ -19,8 +19,8 @@ points. One pass is a modified Newton step with the factorised linear stiffness 
    and tangent stiffness along u, so that K/s approximates the tangent stiffness.
 
 Passes evaluate only the region of the softened elements. When the residual there is within the
-tolerances, the whole solid is measured: r from the law of every element, without the factorised
-K, and the gap with new rays at the displaced nodes. The iteration has converged when
+tolerances, the whole solid is measured: r from the law of every element, without the factorised K,
+and the gap with new rays at the displaced nodes. The iteration has converged when
 
     |r| / |f| <= force_tolerance
     s |r · u| / (f · u) <= work_tolerance,    s = (f_int(u) · u) / (uᵀ K_T u)
@@ -31,10 +31,10 @@ and the active set has stopped changing. The result reports these residuals. The
 estimates the relative error of the approach, because an error du = e u leaves r = e K_T u. The load
 and lambda >= 0 hold to rounding in every pass.
 
-After `max_passes` an iteration that began with the loads h of an earlier solution begins again
-without them. If this does not converge either, `solve_by_newton` continues. This full Newton
-iteration is also the reference: every step factorises the tangent stiffness, and solves the
-contact on the compliance of this tangent. The two iterations share only the contact conditions.
+After `max_passes` an iteration that began with the loads of an earlier solution begins again
+without them. `solve_by_newton` continues if this fails, too. This full Newton iteration is also the
+reference: every step factorises the tangent stiffness and solves the contact on its compliance. The
+two share only the contact conditions.
 """
 
 from dataclasses import dataclass, replace
@@ -101,12 +101,7 @@ def solve(
 ) -> Solution:
     """Return the contact at a pose under a load, or at approach 0 if the load is None.
 
-    Args:
-        problem: solid, boundary and femoral component.
-        pose: pose_femoral_in_insert, shape (4, 4).
-        load: force along -y, N, or None.
-        guess: initial guess.
-        settings: tolerances and largest number of passes.
+    `load` is the force along -y, N; `pose` is pose_femoral_in_insert (4, 4).
     """
     points = problem.surface_points[guess.candidates]
     balance: LinearBalance | NonlinearBalance
@@ -157,10 +152,8 @@ def solve_pass(
     """Return the contact on given femoral planes, and the candidates' displacement (m, 3), m.
 
     Args:
-        response: response of the candidates.
         offset: candidates' displacement without contact forces, m, shape (m, 3).
         points: undeformed candidates, m, shape (m, 3).
-        planes: femoral planes over the candidates.
         load: N, or None for approach 0.
         active: first guess of the active set, shape (m,).
     """
@@ -172,16 +165,10 @@ def solve_pass(
 class SlidingNodes:
     """The femoral planes over the candidates, updated as the nodes slide.
 
-    Each pass solves the contact on tangent planes. Then new rays through the displaced nodes give
-    the next planes. The nodes can oscillate where the femoral normal turns quickly (a rim, a
-    coarse triangle). Then the rays follow the nodes only part of the way.
-
-    Args:
-        problem: solid and femoral component.
-        points: undeformed candidates, m, shape (m, 3).
-        displacement: their initial displacement, m, shape (m, 3).
-        pose: pose_femoral_in_insert, shape (4, 4).
-        planes: femoral planes over the undeformed candidates.
+    Each pass solves the contact on tangent planes, then new rays through the displaced nodes give
+    the next ones. The nodes can oscillate where the femoral normal turns quickly (a rim, a coarse
+    triangle); then the rays follow the nodes only part of the way. Points and displacement (m, 3),
+    m, are those of the undeformed candidates.
     """
 
     def __init__(
@@ -202,7 +189,7 @@ class SlidingNodes:
         return tangent_planes(self._problem, positions, self._pose, self.planes)
 
     def follow(self, displacement: Array, forces: ContactForces) -> float:
-        """Update the planes for a displacement (m, 3), m. Return the same number as `gap`."""
+        """Update the planes for a displacement (m, 3), m, and return its `gap`."""
         positions = self._points + displacement
         planes = self._planes_over(positions)
         relative_gap = self._relative_gap(planes, displacement, forces)
@@ -219,8 +206,8 @@ class SlidingNodes:
     def gap(self, displacement: Array, forces: ContactForces) -> float:
         """Return the largest distance of a displaced active node from the femoral surface.
 
-        Penetrations of other nodes count too. The distance is relative to the largest displacement
-        of an active node. It is inf if no node is active.
+        Penetrations of other nodes count too. It is relative to the largest displacement of an
+        active node; inf if no node is active.
         """
         planes = self._planes_over(self._points + displacement)
         return self._relative_gap(planes, displacement, forces)
@@ -246,13 +233,8 @@ def solve_by_newton(
 ) -> Solution:
     """Return the result of `solve` by the full Newton iteration.
 
-    Args:
-        problem: see `solve`.
-        pose: see `solve`.
-        load: see `solve`.
-        guess: candidates and first active set; its compliance is not used.
-        settings: see `solve`.
-        field: initial displacement, m, shape (n, 3); zero by default.
+    `field` (n, 3), m, is the initial displacement, zero by default. The guess's compliance is not
+    used.
 
     Raises:
         ComputationError: the tangent is not positive definite, or the iteration diverges.

@@ -4,24 +4,23 @@ The loops follow Sharma (2008), section 4.5.5. Nodes in contact get the vertical
 brings them onto the femoral component, and slide freely in x and z. All other nodes have no load.
 
 Linear: a unit displacement of the nodes in contact gives the slope of the reaction F. One
-correction of the approach D then gives the load, if the contact set does not change.
-Nonlinear: at fixed D, Newton steps with the tangent springs bring the free nodes to equilibrium.
-Then D_new = D (load/F)^(1/m). Sharma (2008) has m = 1. This oscillates without end if F grows with
-the square of D or faster, as it does while nodes come into contact. So tkamb takes the exponent of
-this growth between the last two D as m.
-Sharma (2008) does not define what happens to nodes in tension. tkamb releases them, and adds nodes
-that the femoral component penetrates.
+correction of the approach D then gives the load, if the contact set does not change. Nonlinear: at
+fixed D, Newton steps with the tangent springs bring the free nodes to equilibrium. Then D_new = D
+(load/F)^(1/m). Sharma (2008) has m = 1, which oscillates without end if F grows with D² or faster,
+as it does while nodes come into contact. tkamb takes the exponent of this growth between the last
+two D as m. It also releases nodes in tension, which Sharma (2008) does not define, and adds
+penetrated ones.
 
 No step factorises a matrix, although the free unknowns change with the contact set. `prepare`
-stores the factor of the undeformed insert, K = L Lᵀ, and the response of the held unknowns,
-Z = L⁻¹ E (the columns of E are their unit forces). With these,
+stores the factor of the undeformed insert, K = L Lᵀ, and the response of the held unknowns, Z = L⁻¹
+E (the columns of E are their unit forces). With these,
 
     P = L⁻ᵀ (1 − Z (ZᵀZ)⁻¹ Zᵀ) L⁻¹
 
 is the inverse of K on the free unknowns. A prescribed displacement d of the held unknowns displaces
-the lattice by L⁻ᵀ Z (ZᵀZ)⁻¹ d. The tangent stiffness differs from K only in the few springs that
-have softened. So the conjugate gradient method, preconditioned by P, needs few iterations (Saad
-2003, section 9.2). The rounding of the stored factor changes only the number of iterations.
+the lattice by L⁻ᵀ Z (ZᵀZ)⁻¹ d. The tangent stiffness differs from K only in the few softened
+springs, so the conjugate gradient method, preconditioned by P, needs few iterations (Saad 2003,
+section 9.2). The rounding of the stored factor changes only their number.
 """
 
 from dataclasses import dataclass, replace
@@ -68,12 +67,7 @@ CONJUGATE_GRADIENT = ConjugateGradientSettings()
 
 
 class CandidateResponse:
-    """Stored response to vertical forces on the candidate nodes.
-
-    Args:
-        problem: solid and factor.
-        candidates: positions of the candidates among the contact nodes, shape (m,).
-    """
+    """Stored response to vertical forces on the candidate nodes, `candidates` (m,)."""
 
     def __init__(self, problem: ContactProblem, candidates: Index) -> None:
         self.problem = problem
@@ -88,13 +82,7 @@ class CandidateResponse:
 
 
 class HeldNodes:
-    """The lattice while the vertical displacement of the active candidates is prescribed.
-
-    Args:
-        response: response of the candidates.
-        active: mask of the active candidates, shape (m,).
-        settings: settings of the linear solver.
-    """
+    """The lattice while the vertical displacement of the `active` (m,) candidates is prescribed."""
 
     def __init__(
         self,
@@ -120,10 +108,7 @@ class HeldNodes:
         return float(cho_solve(self._factor, np.ones(len(self._chosen))).sum())
 
     def spread(self, prescribed: Array) -> Array:
-        """Return the displacement (n, 3), m, of the linear lattice for prescribed y (a,), m.
-
-        The active nodes have the prescribed y without rounding error.
-        """
+        """Return the displacement (n, 3), m, of the linear lattice for prescribed y (a,), m."""
         count = len(self._response.problem.solid.nodes)
         if not len(prescribed):
             return np.zeros((count, 3))
@@ -135,11 +120,9 @@ class HeldNodes:
         return field
 
     def solve(self, tangent: Tangent, force: Array) -> Array:
-        """Return the displacement (n, 3), m, of the free unknowns under a force.
+        """Return the displacement (n, 3), m, of the free unknowns under a force (n, 3), N.
 
-        Args:
-            tangent: tangent stiffness of the springs.
-            force: N, shape (n, 3); forces on held unknowns have no effect.
+        Forces on held unknowns have no effect.
         """
         solid, settings = self._response.problem.solid, self._settings
         assert isinstance(solid, SourceNetwork)
@@ -163,7 +146,6 @@ class HeldNodes:
         return np.asarray(solution.reshape(shape))
 
     def _free(self, values: Array) -> Array:
-        """Return values (3n,) with zeros at the held unknowns."""
         return np.where(self.held, 0.0, values.ravel())
 
     def _solve_linear(self, force: Array) -> Array:
@@ -219,9 +201,9 @@ LOOP = LoopSettings()
 class SourceLattice(CellContact):
     """Springs of equal stiffness k = E·C between neighbours; see `source_springs`.
 
-    Contact is vertical as in Sharma (2008): nodes are pressed along y and slide freely in x and
-    z, so that no horizontal force arises. The model is for comparison: with free sides it is too
-    stiff (12 % on a cube of 12 cells), and its Poisson's ratio is 0.35 for every material.
+    Contact is vertical as in Sharma (2008): nodes slide freely in x and z. The model is for
+    comparison: with free sides it is too stiff (12 % on a cube of 12 cells), and its Poisson's
+    ratio is 0.35 for every material.
 
     Args:
         law: "nonlinear" (the material's curve for every spring) or "linear".
@@ -292,8 +274,8 @@ def solve_by_loops(
 ) -> Solution:
     """Return the result of `solver.solve` by Sharma's loops.
 
-    `solver.solve` has the arguments. The problem's `direction` is "vertical". Of the guess, only
-    the candidates, their planes and their reach are used.
+    The problem's `direction` is "vertical". Of the guess, only candidates, planes and reach are
+    used.
     """
     nodes = problem.contact_nodes[guess.candidates]
     points = problem.surface_points[guess.candidates]
@@ -367,7 +349,7 @@ def _press(
     """Return the equilibrium for the prescribed vertical displacement of the active nodes.
 
     The first step is linear, as in Sharma (2008). Tangent steps follow, until the residual is below
-    `target` times the contact force. A step that raises the residual is halved.
+    `target` times the contact force. A step that raises it is halved.
     """
     solid = response.problem.solid
     assert isinstance(solid, SourceNetwork)

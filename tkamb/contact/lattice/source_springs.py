@@ -57,12 +57,8 @@ class Tangent:
 class SourceNetwork(Solid):
     """Springs of equal stiffness, linear or with the material's curve; see `Solid`.
 
-    Args:
-        nodes: m, shape (n, 3).
-        cells: nodes of the cells, shape (c, 8). Only the strains that decide on flags need them.
-        spacing: edges of a cell, m, shape (3,).
-        material: E and the stress-strain curve; its Poisson's ratio has no effect.
-        springs: end nodes of the springs, shape (s, 2).
+    Cells (c, 8) are needed only for the strains that decide on flags. The material's Poisson's
+    ratio has no effect. `springs` (s, 2) are end nodes.
     """
 
     def __init__(
@@ -114,7 +110,7 @@ class SourceNetwork(Solid):
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
         """Return the sum of (d sigma/d eps) C n nᵀ of the springs, N/m, (3n, 3n).
 
-        As in Sharma (2008), it neglects that loaded springs turn. It is therefore not exact.
+        As in Sharma (2008), it neglects that loaded springs turn.
         """
         if self.material.is_linear:
             return self.stiffness
@@ -143,7 +139,6 @@ class SourceNetwork(Solid):
 
     @cached_property
     def _straight(self) -> Array:
-        """Unit directions (s, 3) of the undeformed springs."""
         return self.lines / self.lengths[:, None]
 
     @cached_property
@@ -170,14 +165,9 @@ class SourceNetwork(Solid):
 def _add_tangent_forces(
     springs: Index, direction: Array, stiffness: Array, displacement: Array, total: Array
 ) -> None:
-    """Add the forces k n (n · (u_b − u_a)) of springs to nodal forces.
+    """Add the forces k n (n · (u_b − u_a)) of springs a-b to `total` (n, 3), N, in place.
 
-    Args:
-        springs: end nodes a and b, shape (s, 2).
-        direction: n, unit vector from a to b, shape (s, 3).
-        stiffness: k, N/m, shape (s,).
-        displacement: u, m, shape (n, 3).
-        total: nodal forces, N, shape (n, 3), changed in place.
+    `direction` (s, 3) is n, from a to b; `stiffness` (s,) k, N/m; `displacement` u, m.
     """
     for s in range(len(springs)):
         a, b = springs[s]

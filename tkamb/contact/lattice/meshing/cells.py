@@ -168,19 +168,13 @@ REFERENCE_GRADIENTS = np.stack([shape_gradients(at) for at in _GAUSS])
 
 
 def _jacobians(corners: Array) -> Array:
-    """Return the Jacobians (s, 8 points, 3, 3), m, of cells (s, 8, 3)."""
     return np.einsum("gnd,snx->sgdx", REFERENCE_GRADIENTS, corners)
 
 
 def gauss_gradients(corners: Array) -> tuple[Array, Array]:
-    """Return shape-function gradients and weights at the 2×2×2 Gauss points.
+    """Return gradients (s, 8 points, 8 nodes, 3), 1/m, and weights (s, 8), m³, at Gauss points.
 
-    Args:
-        corners: m, shape (s, 8, 3).
-
-    Returns:
-        Gradients (s, 8 points, 8 nodes, 3), 1/m, and weights (s, 8), m³. The weights add up to
-        the cell's volume. A cell with a weight <= 0 is inverted.
+    The weights add up to the cell's volume; a cell with a weight <= 0 is inverted.
     """
     jacobian = _jacobians(corners)
     # The eight Gauss points of the unit cube have equal weights.
@@ -193,9 +187,8 @@ def gauss_gradients(corners: Array) -> tuple[Array, Array]:
 def mean_gradient(corners: Array) -> tuple[Array, Array]:
     """Return the volume-averaged gradients g_i (s, 8, 3), 1/m, and the volume (s,), m³.
 
-    A linear field has its exact gradient: sum_i x_i g_i = identity (Flanagan & Belytschko,
-    Int J Numer Meth Eng 17:679, 1981). The cofactors of the Jacobian replace its inverse, so that
-    inverted cells cause no error.
+    A linear field has its exact gradient: sum_i x_i g_i = identity (Flanagan & Belytschko, Int J
+        Numer Meth Eng 17:679, 1981). The Jacobian's cofactors also suit inverted cells.
     """
     gradients, volume = np.zeros((len(corners), 8, 3)), np.zeros(len(corners))
     j, cofactor = np.empty((3, 3)), np.empty((3, 3))

@@ -1,10 +1,9 @@
 """The insert's nodes on every vertical grid line, by rules 7 to 9 of Sharma (2008).
 
-A line along y is inside the part (the insert) over some intervals. The node nearest to an
-interval's end is moved onto the surface (half-cell rule). Rules 8 and 9 are for intervals thinner
-than a cell.
+The node nearest to an end of the intervals of a line along y inside the part (the insert) is moved
+onto the surface (half-cell rule). Rules 8 and 9 are for intervals thinner than a cell.
 
-With level layers a dish would be a staircase. Wherever the number of cells in a column changes, a
+With level layers a dish would be a staircase: wherever the number of cells in a column changes, a
 wedge under the surface would belong to no cell (3.4 to 4 % of the volume of real inserts at 1 mm).
 So the layers between the flat bottom and one reference layer are stretched to the top surface,
 column by column, as far as the edge ratio permits:
@@ -74,10 +73,7 @@ class Levels:
 def follow_top(top: Array, lowest: float, spacing: Array) -> Levels:
     """Return the layers that follow the top surface.
 
-    Args:
-        top: height of the top surface, m, shape (nx, nz); NaN where the column misses the part.
-        lowest: y of the part's lowest point, m; the flat bottom is y = 0.
-        spacing: spacing of the grid, m, shape (3,).
+    `top` (nx, nz), m, is NaN where the column misses the part, `lowest` (m) y of its lowest point.
     """
     across = spacing[[0, 2]]
     thinnest, thickest = across.max() / MAX_EDGE_RATIO, across.min() * MAX_EDGE_RATIO
@@ -93,9 +89,9 @@ def follow_top(top: Array, lowest: float, spacing: Array) -> Levels:
 def _reference_layers(top: Array, thinnest: float, thickest: float, spacing: float) -> int:
     """Return the number of layers that can follow the largest part of the top surface.
 
-    The layers end in a step where the top is more than half a layer too low for them. The edge of
-    a step has cells on one side only, and is therefore too soft. A number of layers that causes
-    steps in the dishes is excluded. Steps on higher parts are allowed: no condyle meets them.
+    They end in a step where the top is more than half a layer too low for them. The edge of a step
+    has cells on one side only and is too soft. So a number with steps in the dishes is excluded; on
+    higher parts they are allowed, because no condyle meets them.
     """
     candidates = np.arange(1, int(np.ceil(top.max() / thinnest)) + 1)
     stepped = np.array([np.mean(top < (n - 0.5) * thinnest) for n in candidates])
@@ -258,18 +254,15 @@ def place_columns(surface: Surface, spacing: Array) -> NodeField:
 def interval_ends(low: Array, high: Array, count: int) -> Ends:
     """Return the end nodes of intervals [low, high] of a line.
 
-    All heights are in layers. T = high - low is the thickness, and n the number of nodes strictly
-    inside. In general, the node nearest to each end is moved to that end. The exceptions are:
+    Heights are in layers. T = high - low is the thickness, and n the number of nodes strictly
+    inside. The node nearest to each end is moved to that end, except:
 
         n = 0, T <= 1/2   one node, moved to the mean height
         n = 1, T <= 1/2   one node, not moved
         n = 1, T > 1/2    if the node is nearest to both ends, it is moved to the nearer end, and
                           the next node outside is moved to the other end
 
-    Args:
-        low: lower ends (m,).
-        high: upper ends (m,).
-        count: number of nodes of a line.
+    `count` is the number of nodes of a line; the ends have the shape (m,).
     """
     first = np.floor(low + 0.5 + COLUMN_TIE).astype(np.int64)
     last = np.ceil(high - 0.5 - COLUMN_TIE).astype(np.int64)
@@ -288,10 +281,7 @@ def interval_ends(low: Array, high: Array, count: int) -> Ends:
 
 
 def _grid_line(surface: Surface, axis: int, spacing: float) -> Array:
-    """Return equally spaced coordinates over the part, m.
-
-    The first and the last one are moved to the innermost vertices of the part's sides.
-    """
+    """Return equally spaced coordinates over the part, m; the ends lie on its sides."""
     lower, upper = surface.bounds[:, axis]
     line = np.linspace(lower, upper, round((upper - lower) / spacing) + 1)
     values = surface.vertices[:, axis]
@@ -366,15 +356,8 @@ def refired_inwards(
 ) -> Array:
     """Return the heights (n,), m, of nodes that are moved onto walls.
 
-    Walls of a mesh are rough, so that a vertical ray on a wall may miss the part. The target is
-    then moved inside by `wall_inset`, and the ray repeated.
-
-    Args:
-        field: all nodes of the grid.
-        nodes: indices (i, j, k) of the moved nodes.
-        target: new positions of the nodes, m, shape (n, 3), changed in place; y is not used.
-        inward: vectors along x and z into the part, not 0, shape (n, 2).
-        rays: ray caster of the part.
+    A vertical ray on a rough wall may miss the part. The target (n, 3), m, is then moved inside by
+    `wall_inset` along `inward` (n, 2), x and z, in place, and the ray repeated.
     """
     height = refired(field, nodes, target, rays)
     missed = np.flatnonzero(~np.isfinite(height))

@@ -28,11 +28,8 @@ GAUSS_POINTS = 0.5 + np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / (2 * np.sq
 class ContactMap(ContactSurface):
     """The contact surface of a lattice, with its undeformed contact nodes.
 
-    Normals are area-weighted means over the triangles. Areas are those of `consistent_areas`.
-
-    Args:
-        lift: height of the smooth surface above the node on the mesh, m, shape (c,). Gaps are
-            measured from the smooth surface.
+    Normals are area-weighted means over the triangles, areas `consistent_areas`. `lift` (c,), m, is
+    the height of the smooth surface, from which gaps are measured, above the node.
     """
 
     lift: Array
@@ -80,13 +77,11 @@ def consistent_areas(points: Array, squares: Index) -> Array:
 
         A_i = sum over faces of the integral of N_i dA
 
-    A uniform pressure p has the consistent nodal forces p A_i. So force over area is p at every
-    node, also at corners, at oblique outlines and on faces that are almost triangles. Equal shares
-    of the triangles would depend on the diagonals of the faces.
+    A uniform pressure p has the consistent nodal forces p A_i, so that force over area is p at
+    every node, also at corners, oblique outlines and faces that are almost triangles. Equal shares
+    of the triangles would depend on the faces' diagonals.
 
-    Args:
-        points: m, shape (n, 3).
-        squares: nodes around each face, shape (m, 4).
+    Points (n, 3) are in m, squares (m, 4) the nodes around each face.
 
     Source:
         Hughes, The Finite Element Method, Dover 2000, section 3.2 (bilinear quadrilateral).
@@ -112,7 +107,6 @@ def _thickness(points: Array, rays: RayCaster, spacing: Array) -> Array:
 
 
 def _lift(points: Array, rays: RayCaster) -> Array:
-    """Return the height of the smooth surface above the points, m; 0 for points off the mesh."""
     up = np.array([0.0, 1.0, 0.0])
     distance, face, weights = rays.first_in_face(points + RAY_START_HEIGHT * up, -up)
     on_mesh = np.abs(distance - RAY_START_HEIGHT) < ON_MESH_DISTANCE

@@ -2,7 +2,7 @@
 
 The steps follow Sharma (2008), section 4.1: a grid of nearly cubic cells over the bounding box;
 rays along its lines; nodes moved onto the surface by at most half a cell; classes of nodes; cells.
-Pieces that do not stand on the bottom, and very small pieces at the rim, are omitted.
+Pieces that do not stand on the bottom, and very small ones at the rim, are omitted.
 """
 
 import logging
@@ -58,12 +58,8 @@ def connected_pieces(cells: Index) -> Index:
 def standing_pieces(cells: Index, bottom: Mask) -> Mask:
     """Return the mask (c,) of the cells of large pieces that stand on the bottom.
 
-    A piece that does not stand on the bottom has no fixed node, and its stiffness is singular. If
-    no piece stands on the bottom, the largest one is kept.
-
-    Args:
-        cells: nodes of the cells, shape (c, 8).
-        bottom: mask of the nodes in the flat bottom, shape (n,).
+    Any other piece has no fixed node, and its stiffness is singular. If no piece stands on the
+    nodes `bottom` (n,), the largest one is kept.
     """
     if not len(cells):
         return np.ones(0, bool)
@@ -136,9 +132,7 @@ def outer_skin(nodes: Array, cells: Index) -> Surface:
 def solid_volume(insert: Surface, centres: Array) -> float:
     """Return the volume of the mesh's bodies, m³. Where bodies overlap, it counts once.
 
-    Args:
-        insert: closed mesh.
-        centres: points throughout its bodies, m, shape (c, 3), a few per cubic millimetre.
+    `centres` (c, 3), m, are points throughout the bodies, a few per cubic millimetre.
     """
     if not (insert.winding.at(centres) > 1).any():
         return insert.volume
@@ -157,11 +151,8 @@ def volume_error(nodes: Array, cells: Index, insert: Surface) -> float:
 def _sorted_faces(cells: Index) -> tuple[Index, Mask]:
     """Return the faces of all cells, with the two copies of an inner face next to each other.
 
-    The smallest and the largest node identify a face of a grid.
-
-    Returns:
-        Number 6 cell + row of `FACES` of each face, shape (6c,), and whether it is the same face
-        as the next one, shape (6c - 1,).
+    The smallest and the largest node identify a face of a grid. Each is 6 cell + row of `FACES`,
+    (6c,); also returns whether it is the same face as the next one, (6c - 1,).
     """
     ends = np.sort(cells[:, FACES].reshape(-1, 4), axis=1)[:, [0, 3]]
     order = np.lexsort((ends[:, 1], ends[:, 0]))
@@ -268,9 +259,7 @@ def build_grid(insert: Surface, target_size: float) -> Lattice:
 
     The logger "tkamb" logs corrected rays, and a post (cam-post contact is not modelled).
 
-    Args:
-        insert: closed surface in the insert frame (flat bottom in y = 0 facing -y).
-        target_size: desired edge of a cell, m.
+    `target_size` is the desired edge of a cell, m; the flat bottom of the insert is y = 0.
 
     Raises:
         InputError: the surface has too large holes, no cell fits into it, or there would be more
@@ -321,8 +310,7 @@ def make_grid(insert: Surface, target_size: float) -> Lattice:
 def grid_spacing(extent: Array, target_size: float) -> Array:
     """Return the edges (3,), m, of cells that divide a box (3,) evenly.
 
-    The edges are near to the target size. If their ratio would exceed `MAX_EDGE_RATIO`, the
-    nearest size with a smaller ratio is used.
+    They are near the target size, but with a ratio of at most `MAX_EDGE_RATIO`.
     """
     if target_size <= 0.0:
         raise InputError(

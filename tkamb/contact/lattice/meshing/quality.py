@@ -1,8 +1,7 @@
 """The quality of a lattice: volume, edges, corners, shear and corrections.
 
-A lattice can lose features that are thinner than a cell, and whole parts of a faulty mesh. The
-results of a contact do not show this. So `whole_lattice` compares the volumes of lattice and mesh,
-and rejects a lattice if they differ by more than 2 %.
+A lattice can lose features thinner than a cell, and parts of a faulty mesh, which results of a
+contact do not show. So `whole_lattice` rejects a lattice whose volume differs by more than 2 %.
 """
 
 import logging
@@ -42,13 +41,11 @@ BEYOND_REFINEMENT = 0.1
 def whole_lattice(insert: Surface, target_size: float) -> Lattice:
     """Return the lattice of a closed insert, with the volume of the mesh within 2 %.
 
-    If cells of the desired size change the volume by more, somewhat smaller cells are used, with a
-    notice, because the loss at thin rims varies with the size. The logger "tkamb" logs smaller
-    cells, corrected rays, and a post (cam-post contact is not modelled).
+    If cells of the desired size change it by more, somewhat smaller ones are used, with a notice:
+    the loss at thin rims varies with the size. The log "tkamb" has smaller cells, corrected rays,
+    and a post.
 
-    Args:
-        insert: closed surface in the insert frame (flat bottom in y = 0 facing -y).
-        target_size: desired edge of a cell, m.
+    Arguments as in `build_grid`.
 
     Raises:
         InputError: see `build_grid`; or no size keeps the volume, and the message names the
@@ -73,7 +70,6 @@ def whole_lattice(insert: Surface, target_size: float) -> Lattice:
 
 
 def _smaller_cells(target_size: float, share: float, error: float) -> str:
-    """Return the notice about smaller cells than desired, with the reason."""
     size = target_size / MILLIMETRE
     return (
         f"cells of {share * size:.3g} mm are used instead of {size:.3g} mm, because those would "
@@ -84,7 +80,6 @@ def _smaller_cells(target_size: float, share: float, error: float) -> str:
 def _volume_refusal(
     lattice: Lattice, error: float, insert: Surface, target_size: float
 ) -> InputError:
-    """Return the error about a lattice whose volume differs from that of its mesh."""
     part = missing_part(lattice.nodes, lattice.cells, lattice.spacing, insert)
     lacks = f"; it lacks {part}" if error < 0 and part is not None else ""
     return InputError(

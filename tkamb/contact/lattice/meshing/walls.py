@@ -1,12 +1,11 @@
 """Sideways moves of nodes onto walls, which vertical rays do not meet, and into notches.
 
 Walls: if a node has no cell beside it, a ray along x or z gives the distance of the wall. Within
-half a cell the node is moved onto the wall. Otherwise the next node, which is outside, is moved
-inwards onto the wall.
+half a cell the node is moved onto it; otherwise the next node outside is moved inwards onto it.
 
-Notches: a grid follows an oblique surface in steps, and each step leaves a wedge that belongs to
-no cell. The node outside of the wedge is moved into the corner of the part. If the surface is
-straight there, the node is moved almost onto the line between its two neighbours.
+Notches: a grid follows an oblique surface in steps, and each leaves a wedge that belongs to no
+cell. The node outside of the wedge is moved into the corner of the part, or, if the surface is
+straight there, almost onto the line between its two neighbours.
 """
 
 from dataclasses import dataclass
@@ -42,8 +41,8 @@ MAX_MOVE_DIAGONALS = 0.75
 def fill_notches(field: NodeField, before: Array, rays: RayCaster) -> None:
     """Make the fourth node of a grid square a member, if the other three are members.
 
-    Steps of the outline in a layer come first, then steps between layers. `field` is changed in
-    place. `before` (nx, ny, nz, 3), m, are the nodes before moves onto walls.
+    Steps of the outline in a layer come first, then steps between layers. `before` (nx, ny, nz, 3),
+    m, are the nodes before moves onto walls.
     """
     for axes in ((0, 2), (0, 1), (2, 1)):
         member = field.member.copy()
@@ -62,7 +61,6 @@ def fill_notches(field: NodeField, before: Array, rays: RayCaster) -> None:
 
 
 def _shifted(mask: Mask, step: Index) -> Mask:
-    """Return mask[i + di, j + dj, k + dk], and False outside of the grid."""
     padded = np.pad(mask, 1)
     window = tuple(slice(1 + d, 1 + d + n) for d, n in zip(step, mask.shape, strict=True))
     return padded[window]
@@ -130,7 +128,7 @@ def _towards(point: Array, goal: Array, share: float, rise: Array | float) -> Ar
 def _add_members(field: NodeField, notch: Notch, target: Array, usable: Mask, flat: bool) -> None:
     """Make the usable nodes members at their target positions.
 
-    In a horizontal square, a node between two top nodes becomes a top node. Otherwise the forces on
+    In a horizontal square, one between two top nodes becomes a top node; otherwise the forces on
     the other nodes of its cell's upper face would be too large.
     """
     rejected, added = (tuple(n[mask] for n in notch.node) for mask in (~usable, usable))
@@ -266,9 +264,8 @@ def _move_out(field: NodeField, firing: Array, hits: list[WallHits], rays: RayCa
 def _corner_or_wall(start: Array, move: Array, rays: RayCaster) -> Array:
     """Return the new positions (n, 3), m, of nodes beside walls.
 
-    `move` (n, 2), m, is the vector to the walls along x and z, 0 without a wall. With two walls, a
-    node moves to their corner if this lies in the part. Otherwise it moves to the foot of its
-    perpendicular on the line through the two hits.
+    `move` is as in `_add_at`. With two walls, a node moves to their corner if this lies in the
+    part, else to its `_foot`.
     """
     move = move * (1.0 - WALL_INSET)
     corner = start.copy()
