@@ -1,23 +1,21 @@
 """The femoral adjustment and the medial-lateral split: pressing, checking, effect and sensitivity.
 
-The medial-lateral split depends on a rotation that is smaller than the error of fluoroscopy. The
-recorded femur is therefore adjusted until both condyles touch. After the press the adjustment is
-compared with the penetration. Sharma (2008), section 4.3, figure 4-8: "If the final femoral
-penetration and coronal angle is more than the adjustments made, the original orientation of the
-femur is restored and the analysis is reconducted." `AdjustmentSettings.restore_when` selects one of
-two readings of this rule:
+The medial-lateral split depends on a rotation smaller than the error of fluoroscopy. The recorded
+femur is therefore adjusted until both condyles touch (`tkamb.geometry.adjustment`). Sharma (2008),
+section 4.3, figure 4-8: "If the final femoral penetration and coronal angle is more than the
+adjustments made, the original orientation of the femur is restored and the analysis is
+reconducted." `AdjustmentSettings.restore_when` selects one of two readings:
 
-- "both" (Sharma's wording, and the default): the orientation is restored if the penetration
-  exceeds the translation and the coronal angle of the penetrations exceeds the rotation.
-- "either": the orientation is restored if one of the two exceeds its adjustment. The translation of
-  a femur recorded at the right height is small, so nearly every load restores the orientation. The
-  split then jumps if the recorded height changes by a tenth of a millimetre.
+- "both" (Sharma's wording, the default): it is restored if the penetration exceeds the translation
+  and the coronal angle of the penetrations exceeds the rotation.
+- "either": it is restored if one of the two exceeds its adjustment. The translation of a femur
+  recorded at the right height is small, so nearly every load restores the orientation. The split
+  then jumps if the recorded height changes by a tenth of a millimetre.
 
-The result has a flag if a change of the recorded pose by `AdjustmentSettings.input_change` may
-change the decision to restore the orientation.
+A flag marks a result whose decision may change with `AdjustmentSettings.input_change`.
 
-The adjustment should leave the total force unchanged (Sharma 2008, 5.2.2: less than 0.001 BW).
-`adjustment_effect` compares the loads with and without adjustment.
+The adjustment should leave the total force unchanged (Sharma 2008, 5.2.2: less than 0.001 BW); see
+`adjustment_effect`.
 """
 
 from collections.abc import Mapping
@@ -55,12 +53,8 @@ def split_sensitivity(
 ) -> float:
     """Return the change of the medial force with the adduction at a constant load, N/rad.
 
-    It is zero if one condyle carries all of the load. It is NaN if the press with more adduction
-    fails.
-
-    Args:
-        result: the contact before the change of adduction; its load is the force along -y.
-        start: warm start that was returned with this contact; None: made from the contact.
+    It is zero if one condyle carries all of the load, and NaN if the press with more adduction
+    fails. The load is the force of `result` along -y; `start` was returned with it.
     """
     load = -float(result.wrench_on_insert[1])
     coordinates = knee_coordinates(result.pose)
@@ -75,14 +69,10 @@ def split_sensitivity(
 def split_tangent(probe: "Probe", result: ContactResult) -> float:
     """Return the quantity of `split_sensitivity` from the contact's exact tangent, N/rad.
 
-    Let t_a and t_y (3,) be the derivatives of a condyle's force on the insert with respect to
-    adduction a and height y, and n the medial contact normal (upward). At a constant
-    superior-inferior load an adduction da moves the femur by dy = -(sum t_a,y / sum t_y,y) da,
-    where ",y" is the y component. The medial force then changes by -n . (t_a da + t_y dy).
-
-    Args:
-        probe: probe of a contact model whose tangent is exact.
-        result: the contact at which the tangent is evaluated.
+    Let t_a and t_y (3,) be the derivatives of a condyle's force on the insert by adduction a and
+    height y, and n the medial contact normal (upward). At a constant superior-inferior load an
+    adduction da moves the femur by dy = -(sum t_a,y / sum t_y,y) da, and the medial force changes
+    by -n . (t_a da + t_y dy). The tangent of the `probe` is exact.
     """
     coordinates = knee_coordinates(result.pose)
     condyles = probe.seen(result).condyles
@@ -132,11 +122,8 @@ def adjustment_effect(
 ) -> AdjustmentEffect:
     """Return the change of the loads from the recorded to the adjusted contact points.
 
-    Args:
-        adjusted: loads with the contact points of the adjusted pose.
-        recorded: loads with the contact points of the recorded pose, otherwise equal.
-        points_adjusted: side -> contact point of the adjusted pose.
-        points_recorded: side -> contact point of the recorded pose.
+    `points_adjusted` and `points_recorded` are the contact points by side; else the loads are
+    equal.
     """
     total, total_recorded = (
         float(np.linalg.norm(one.contact_force)) for one in (adjusted, recorded)
@@ -167,7 +154,6 @@ def _name_carriers(loads: SolvedLoads, points: Mapping[str, CondylePoint]) -> st
 def _largest_move(
     adjusted: Mapping[str, CondylePoint], recorded: Mapping[str, CondylePoint]
 ) -> str:
-    """Return a phrase that names the contact point with the largest displacement."""
     distances = {
         side: float(np.linalg.norm(adjusted[side].point - recorded[side].point))
         for side in adjusted
@@ -188,15 +174,12 @@ def press_adjusted(
     """Press the adjusted femur in, check the adjustment, and undo its rotation if required.
 
     Args:
-        state: state that the model's `prepare` returned.
         load: superior-inferior force, N.
-        adjustment: adjustment of the recorded pose, from `tkamb.geometry.adjustment.adjust`.
         query: closest points of the same pair of bodies.
         start: an earlier result or a warm start, to save time.
 
     Returns:
-        The contact with the flags of the adjustment added, the checked adjustment, and the warm
-        start of the next press.
+        The contact with the adjustment's flags, the checked adjustment, and a warm start.
 
     Raises:
         ComputationError: the femoral component does not lie over the insert.

@@ -1,9 +1,8 @@
 """Finds the knee in a Pinocchio model: its frames, its joints, and the bodies of the shank.
 
-The knee divides the tree of a model in two. The shank is every body on the tibia's side of the
-knee, including the foot. The thigh is the body to which the frame "femur" is fixed. The pelvis acts
-on the thigh by the load at the hip. The same equations therefore hold for a leg that stands on its
-foot, a leg that hangs from a pelvis, and a whole body.
+The shank is every body on the tibia's side of the knee, including the foot; the thigh the body to
+which the frame "femur" is fixed. The pelvis acts on it by the load at the hip. The same equations
+therefore hold for a leg that stands on its foot, one that hangs from a pelvis, and a whole body.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,12 +24,7 @@ INSERT_JOINT, PLANE_JOINT = "knee_ap", "patella_ap"
 
 @dataclass(frozen=True, eq=False)
 class FixedFrame:
-    """A frame that is fixed to a joint of the model.
-
-    Args:
-        joint: index of the joint in the model.
-        placement: pose of the frame in the joint's frame.
-    """
+    """A frame that is fixed to a joint of the model, by the joint's index and a pose in it."""
 
     joint: int
     placement: pin.SE3
@@ -129,7 +123,6 @@ def find_anatomy(
     """Find the frames and joints of the knee in a model.
 
     Args:
-        model: any Pinocchio model.
         names: part of `PARTS` -> name of its frame in the model; None: its default.
         joints: expected names of the knee's joints; empty: no check.
         plane: pose of the patella's sagittal plane in the frame "femur"; None: the default of
@@ -193,9 +186,9 @@ def find_anatomy(
 
 
 def _offers(model: pin.Model, part: str) -> bool:
-    """Return whether the model has a frame with the name of a part. Frames of joints do not count:
+    """Return whether the model has a frame with the name of a part.
 
-    a joint "hip" need not lie in the hip centre.
+    Frames of joints do not count: a joint "hip" need not lie in the hip centre.
     """
     return any(f.name == part and f.type != pin.FrameType.JOINT for f in model.frames)
 
@@ -290,10 +283,9 @@ LEAST_LEVER = 0.05
 
 
 def check_not_exchanged(anatomy: Anatomy) -> None:
-    """Raise an error if the masses of the model say that femur and tibia are exchanged.
+    """Raise an InputError if the masses say that femur and tibia are exchanged.
 
-    Raises:
-        InputError: the femur's centre of mass lies below the knee, and the tibia's above it.
+    Then the femur's centre of mass lies below the knee, and the tibia's above it.
     """
     levers = [_centre_height(anatomy.model, frame) for frame in (anatomy.femoral, anatomy.insert)]
     if -levers[0] > LEAST_LEVER and levers[1] > LEAST_LEVER:

@@ -3,16 +3,16 @@
     tibia -> (six knee coordinates) -> femur -> (patella's sagittal plane) -> patella
 
 The chain contains the inertia of thigh and patella. The shank and all bodies attached to it stay in
-the user's model: their equations of motion give the wrench that the knee must exert on the shank.
-The chain always describes a right knee: the input of a left knee is mirrored, and its loads are
-mirrored back.
+the user's model, whose equations of motion give the wrench that the knee must exert on it. A left
+knee is mirrored at input, and its loads are mirrored back.
 
-Let v and a be the spatial velocities and accelerations of femur (F) and tibia (T). Let s be the
-twist of the femur relative to the tibia, and s' its rate, in the femur's axes. The equations
+With the spatial velocities v and accelerations a of femur (F) and tibia (T), the femur's twist s
+relative to the tibia and its rate s', in the femur's axes,
 
     s = v_F - X v_T,    s' = a_F - X a_T - v_F x s,    J qd = s,    J qdd = s' - J' qd
 
-give the rates qd and qdd of the knee coordinates, for any joints of the user's model.
+these equations give the rates qd and qdd of the knee coordinates, for any joints of the user's
+model.
 """
 
 from collections.abc import Sequence
@@ -72,11 +72,8 @@ def se3(pose: Array) -> pin.SE3:
 class CanonicalChain(Chain):
     """The canonical chain of one knee, described at the top of this module.
 
-    Args:
-        is_left: whether the knee is a left one.
-        with_patella: whether the chain has a patella.
-        component: axes of the femoral component, fixed to the femur's joint.
-        insert: the insert frame, fixed to the tibia's joint.
+    `component` are axes of the femoral component, fixed to the femur's joint; `insert` is the
+    insert frame, fixed to the tibia's joint.
     """
 
     def __init__(
@@ -150,11 +147,11 @@ def _add_body(model: pin.Model, name: str, joint: int, placement: pin.SE3 | None
 
 @dataclass(frozen=True, eq=False)
 class KneePose:
-    """The pose of a knee at one instant. A left knee is described by its mirror image.
+    """The pose of a right knee, or of the mirror image of a left one, at one instant.
 
     Args:
         pose: pose of the femoral component in the insert frame, shape (4, 4).
-        patella: coordinates of the patella, shape (3,), m, m, rad; None: the model has no patella.
+        patella: coordinates (3,), m, m, rad; None: the model has no patella.
     """
 
     pose: Array
@@ -169,11 +166,8 @@ class KneePose:
 class Bridge:
     """Converts poses, motions and loads between the user's model and the canonical chain.
 
-    Args:
-        is_left: whether the knee is a left one.
-        chain: the canonical chain.
-        component: axes of the femoral component, fixed to the femur's joint.
-        insert: the insert frame, fixed to the tibia's joint.
+    `component` and `insert` are those of `CanonicalChain`. A `data` of the methods is Pinocchio
+    data of the user's model, with joint placements up to date.
     """
 
     def __init__(
@@ -231,11 +225,7 @@ class Bridge:
         )
 
     def knee_pose(self, data: Any) -> KneePose:
-        """Return the pose of the knee.
-
-        Args:
-            data: Pinocchio data of the user's model, with joint placements up to date.
-        """
+        """Return the pose of the knee."""
         insert = data.oMi[self.insert.joint] * self.insert.placement
         femur = data.oMi[self.component.joint] * self.component.placement
         pose = self._right(insert.actInv(femur))
@@ -253,8 +243,7 @@ class Bridge:
     def twist(self, data: Any) -> Array:
         """Return the femur's twist (6,) relative to the insert, at the insert's origin and axes.
 
-        Args:
-            data: Pinocchio data of the user's model, with placements and velocities up to date.
+        `data` has velocities up to date.
         """
         total, joint = np.zeros(6), self.component.joint
         if joint:
@@ -267,10 +256,8 @@ class Bridge:
     def motion(self, data: Any, patella: bool) -> ChainMotion:
         """Return the motion of the chain.
 
-        Args:
-            data: Pinocchio data of the user's model, after `pin.forwardKinematics(..., q, v, a)`.
-            patella: whether the chain has a patella. If the user's model has none, its coordinates
-                and rates are zero.
+        `data` is that after `pin.forwardKinematics(..., q, v, a)`. Without a patella in the user's
+        model, its coordinates and rates are zero.
         """
         anatomy, knee = self.anatomy, self.knee_pose(data)
         tibia, zero = anatomy.tibia, pin.Motion.Zero()
@@ -307,13 +294,8 @@ class Bridge:
     ) -> Array:
         """Return coordinates, rates and accelerations (3, n) between two bodies.
 
-        Args:
-            q: configuration of the chain, with its root at the neutral pose, shape (nq,).
-            coordinates: coordinates between the two bodies, shape (n,), m and rad.
-            data: Pinocchio data of the user's model.
-            base: frame on the parent body.
-            follower: frame on the child body.
-            rows: slice of these coordinates in the chain's joint coordinates.
+        q is that of the chain with its root at the neutral pose; `base` is on the parent body,
+        `follower` on the child; `rows` are these coordinates in the chain's joint coordinates.
         """
         twist, rate = self._relative(data, base, follower)
         model, cache = self.chain.model, self._chain_data
@@ -362,11 +344,8 @@ class Bridge:
     def configuration(self, q: Array, target: Array) -> Array:
         """Return q with the knee's joints changed so that the femur has a given pose.
 
-        Newton's method finds the coordinates of the joints between tibia and femur.
-
-        Args:
-            q: configuration of the user's model, shape (nq,).
-            target: pose_femoral_in_insert of a right knee.
+        Newton's method finds the coordinates of the joints between tibia and femur. `target` is
+        pose_femoral_in_insert of a right knee.
 
         Raises:
             InputError: these joints cannot produce that pose.
@@ -403,11 +382,9 @@ class Bridge:
     def shank_needs(self, data: Any) -> Array:
         """Return the wrench (6,) that inertia and weight of the shank require, insert frame.
 
-        The wrench is the sum over the shank's bodies. If the tibia is fixed to the universe, it is
-        the negative of the sum over all bodies above the knee.
-
-        Args:
-            data: Pinocchio data, after `pin.forwardKinematics(model, data, q, v, a)`.
+        It sums over the shank's bodies; if the tibia is fixed to the universe, it is the negative
+        of the sum over all bodies above the knee. `data` is that after
+        `pin.forwardKinematics(model, data, q, v, a)`.
         """
         needs = []
         for joint in self._shank:
@@ -419,12 +396,8 @@ class Bridge:
     def on_shank(self, data: Any, external: Any) -> PointForces:
         """Return the sum of the external forces on the shank, at the insert's origin.
 
-        If the tibia is fixed to the universe, the result is the negative of the sum of the forces
-        above the knee.
-
-        Args:
-            data: Pinocchio data of the user's model, with joint placements up to date.
-            external: forces on the joints, each in its joint's frame.
+        If the tibia is fixed to the universe, it is the negative of the sum above the knee.
+        `external` are forces on the joints, each in its joint's frame.
         """
         wrench = self._sum(data, self._shank, [external[joint] for joint in self._shank])
         return PointForces("tibia", np.zeros((1, 3)), wrench[None, :3], wrench[3:])
@@ -451,7 +424,6 @@ class Bridge:
         """Return loads on the chain's links as forces on the user's joints.
 
         Args:
-            data: Pinocchio data of the user's model, with joint placements up to date.
             loads: link -> wrench (6,) about the insert's origin, insert frame; or point forces.
 
         Returns:
@@ -474,11 +446,7 @@ class Bridge:
         return self.insert.joint if link == "tibia" else self.component.joint
 
     def to_joint(self, data: Any, link: str) -> Array:
-        """Return the matrix (6, 6) that maps a force from the insert frame to a link's joint.
-
-        Args:
-            data: Pinocchio data of the user's model, with joint placements up to date.
-        """
+        """Return the matrix (6, 6) that maps a force from the insert frame to a link's joint."""
         insert = data.oMi[self.insert.joint] * self.insert.placement
         return np.asarray(data.oMi[self.joint_of(link)].actInv(insert).toDualActionMatrix())
 
@@ -506,10 +474,7 @@ def summed(loads: "dict[str, Array] | list[PointForces]") -> dict[str, Array]:
 
 
 def _solved(jacobian: Array, twist: Array) -> Array:
-    """Return the joint rates that produce a twist (6,).
-
-    With fewer than six joints the result is the least-squares solution. NaN inputs give NaN.
-    """
+    """Return the joint rates that produce a twist (6,), by least squares if fewer than six."""
     if not (np.isfinite(jacobian).all() and np.isfinite(twist).all()):
         return np.full(jacobian.shape[1], np.nan)
     if jacobian.shape[1] == 6:
@@ -522,12 +487,8 @@ def canonical_state(
 ) -> ChainState:
     """Return the chain at one instant, with the inertia of the shank from the user's model.
 
-    Args:
-        chain: the canonical chain.
-        motion: motion of the chain.
-        shank: wrench that inertia and weight of the shank require, shape (6,), insert frame.
-        thigh: external wrench on the thigh, shape (6,), insert frame.
-        patella: external wrench on the patella, shape (6,), insert frame.
+    The wrenches (6,) that inertia and weight of the shank require, and the external ones on thigh
+    and patella, are in the insert frame.
     """
     state = chain.at(motion)
     needs = [("tibia", shank), ("femur", -thigh)]

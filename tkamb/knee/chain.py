@@ -46,8 +46,7 @@ class Chain:
 
     Args:
         urdf: text of a checked URDF (`tkamb.io.recordings.patient.load_urdf`).
-        with_patella: whether the patella moves. If not, it is fixed to the femur at its neutral
-            pose.
+        with_patella: False: the patella is fixed to the femur at its neutral pose.
         gravity: acceleration, downward in the laboratory, m/s².
     """
 
@@ -91,11 +90,7 @@ class Chain:
         return other
 
     def scaled(self, length: float) -> "Chain":
-        """Return the chain of a geometrically similar body of the same density.
-
-        Args:
-            length: factor on all lengths.
-        """
+        """Return the chain of a similar body, `length` times as long, of the same density."""
         other, model = copy.copy(self), pin.Model(self.model)
         for joint in range(1, model.njoints):
             inertia, placement = model.inertias[joint], model.jointPlacements[joint]
@@ -113,7 +108,6 @@ class Chain:
         return other
 
     def _set_model(self, model: pin.Model) -> None:
-        """Use a model for this chain, and store the poses of insert and tibia in its root."""
         self.model = model
         frames = enumerate(model.frames)
         self._frames = {frame.name: k for k, frame in frames if frame.type == pin.FrameType.BODY}
@@ -252,11 +246,7 @@ class ChainState:
         return total
 
     def add_need(self, link: str, wrench: Array) -> None:
-        """Add a wrench (6,) to the wrench that all loads together must exert on a link.
-
-        Args:
-            wrench: force (N) and moment about the insert's origin (N·m), insert frame, shape (6,).
-        """
+        """Add a wrench (6,) about the insert's origin to that required on a link."""
         self.inertial = self.inertial + self._jacobian(link).T @ wrench
 
     def _jacobian(self, link: str) -> Array:

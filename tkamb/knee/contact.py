@@ -131,9 +131,7 @@ class KneeContact:
     def wrench(self, contact: ProbedContact, twist: Array) -> Array:
         """Return the wrench (6,) on the insert, including friction.
 
-        Args:
-            contact: the contact at the pose.
-            twist: twist of the femur relative to the insert, shape (6,).
+        `twist` (6,) is that of the femur relative to the insert.
         """
         total = np.zeros(6)
         for load in contact.loads:
@@ -143,15 +141,11 @@ class KneeContact:
         return total
 
     def _friction(self, load: CondyleWrench, twist: Array, changes: Array) -> Array:
-        """Return the wrench of friction on the insert, and its changes; see `_friction_wrench`."""
         still = CONTACT_POINT.standstill_speed
         return _friction_wrench(load.wrench, load.centre, twist, changes, self.friction, still)
 
     def damping(self, contact: ProbedContact, twist: Array) -> Array:
-        """Return the derivative (6, 6) of the wrench on the insert with respect to the twist.
-
-        Only friction depends on the femur's twist.
-        """
+        """Return the derivative (6, 6) of the wrench on the insert by the twist: of friction."""
         total = np.zeros((6, 6))
         for load in contact.loads if self.friction else ():
             total += self._friction(load, twist, BY_TWIST)[:, 1:]
@@ -164,8 +158,6 @@ class KneeContact:
 
         Args:
             probe: probe of the model; its state is the warm start.
-            femur_pose: pose of the femoral component, shape (4, 4).
-            contact: the contact at this pose.
             twist: constant twist of the femur, shape (6,).
             exact: True: central differences replace an approximate tangent of the model.
         """
@@ -215,13 +207,8 @@ def _friction_wrench(
     the moment m_c = m - c x f about the centre c. With the sliding velocity s = v + w x p and its
     tangential part t = s - (s . n) n, the friction is mu N t/sqrt(t . t + v0²), at p.
 
-    Args:
-        wrench: (6,) f (N) and m (N·m) on the insert.
-        centre: (3,) m, centre of pressure.
-        twist: (6,) v (m/s) and w (rad/s) of the femur against the insert.
-        changes: (15, k) changes of wrench, centre and twist.
-        friction: 1, mu.
-        still: m/s, v0.
+    `wrench` is f and m on the insert, `twist` v and w of the femur against it, `changes` (15, k)
+    are those of wrench, centre and twist, `friction` is mu and `still` v0 (m/s).
     """
     f, m, c = _three(wrench, 0), _three(wrench, 3), _three(centre, 0)
     v, w = _three(twist, 0), _three(twist, 3)
@@ -283,10 +270,7 @@ def differences(
 ) -> Array:
     """Return the derivative (6, 6) of a wrench by a small displacement, by central differences.
 
-    Args:
-        wrench: function of a pose (4, 4) that returns a wrench (6,).
-        femur_pose: pose at which the wrench is differentiated, shape (4, 4).
-        settings: steps of the differences.
+    `wrench` is a function of a pose (4, 4) that returns a wrench (6,).
     """
     columns = []
     for k in range(6):

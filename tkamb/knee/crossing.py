@@ -1,36 +1,32 @@
 """Muscles across the knee, other than the extensor group, in the equations of one frame.
 
-A taut line runs from the shank at p to the thigh or pelvis at q. A force F pulls the shank at p
-along u = (q - p)/|q - p|, and the thigh at q along -u. Foot and shank are one body: a line that
-ends on the foot pulls this body at the point where the line leaves the foot. The force of a line
-from the pelvis acts on the femur, and the hip loads balance this force. Both ends are fixed to
-their links.
+A taut line runs from the shank at p to the thigh or pelvis at q, both ends fixed to their links. A
+force F pulls the shank at p along u = (q - p)/|q - p|, and the thigh at q along -u. Foot and shank
+are one body: a line that ends on the foot pulls it where the line leaves the foot. The force of a
+line from the pelvis acts on the femur, and the hip loads balance it.
 
 With fixed contact points and lines the equations are linear in all loads. This has two uses.
 
-1. The tension of the extensor group is Q = Q_0 + sum_i g_i F_i + h r. Q_0 is the tension without
-   the other muscles, F_i are the forces of the other muscles, and r is a moment on the tibia about
-   the insert's z. Solved for r, the equation is the knee's row of a static optimisation
-   (`flexion_row`),
+1. The tension of the extensor group is Q = Q_0 + sum_i g_i F_i + h r, with Q_0 without the other
+   muscles, their forces F_i, and a moment r on the tibia about the insert's z. Solved for r, this
+   is the knee's row of a static optimisation (`flexion_row`),
 
        -Q_0/h = -(1/h) Q + sum_i (g_i/h) F_i + r.
 
-   The row includes contact, ligaments, patella and friction. -1/h is the moment arm of the extensor
-   group, and -Q_0/h is the moment that all muscles together supply. If coordinates are released,
+   It includes contact, ligaments, patella and friction. -1/h is the moment arm of the extensor
+   group, and -Q_0/h the moment that all muscles together supply. If coordinates are released,
    contact points and the medial-lateral split depend on the muscles. The row then comes from the
-   tension of the patellar ligament. The tangent of contact and ligaments gives this tension as a
-   linear function of the muscle forces (`ReleasedForces.tension_per_wrench`,
-   `yielding_flexion_row`).
+   tension of the patellar ligament, linear in the muscle forces by the tangent of contact and
+   ligaments (`ReleasedForces.tension_per_wrench`, `yielding_flexion_row`).
 
 2. A normal force is the sum of the contributions of all loads (`condyle_contributions`),
 
        N_side = N_side(weight, inertia and ground) + N_side(ligaments) + sum_i N_side(muscle i),
 
-   plus N_side(post) if a cam on the insert's post is modelled. Each term is computed with all other
-   muscles and ligaments at zero force. A moment about the insert's z balances the flexion moment of
-   each term. As in every frame, residuals balance the AP and ML force and the axial moment. The sum
-   of the moments about z over all terms is the knee's reserve. The extensor group is one muscle
-   here.
+   plus N_side(post) if a cam on the insert's post is modelled. Each term has all other muscles and
+   ligaments at zero force, and a moment about the insert's z balances its flexion moment; over all
+   terms these moments add up to the knee's reserve. As in every frame, residuals balance the AP and
+   ML force and the axial moment. The extensor group is one muscle here.
 
 References: Winby et al., J Biomech 42:2294 (2009), doi:10.1016/j.jbiomech.2009.06.019;
 Sasaki & Neptune, J Biomech 43:2780 (2010), doi:10.1016/j.jbiomech.2010.06.011.
@@ -59,9 +55,8 @@ class CrossingLines:
 
     Args:
         shank: points where the lines leave the shank or foot, tibia frame, shape (c, 3), m.
-        thigh: points where the lines arrive at the thigh or pelvis, femur frame, shape (c, 3), m.
-        knee: pose of the femur in the tibia for which the points were computed, shape (4, 4);
-            None: unknown.
+        thigh: points where they arrive at the thigh or pelvis, femur frame, shape (c, 3), m.
+        knee: pose of the femur in the tibia for which they were computed, (4, 4); None: unknown.
     """
 
     shank: Array
@@ -71,9 +66,8 @@ class CrossingLines:
     def turned(self, state: "ChainState") -> float:
         """Return the rotation of the knee since the points were computed, rad; NaN: unknown.
 
-        The end of a line that wraps a bone or passes a via point moves as the knee rotates. Here
-        the ends are fixed to their links. The error of a line's direction is therefore at most
-        about this rotation.
+        The end of a line that wraps a bone or passes a via point moves as the knee rotates, but
+        here it is fixed. The error of the direction is at most about this rotation.
         """
         if self.knee is None:
             return float("nan")
@@ -84,9 +78,7 @@ class CrossingLines:
     def unit_wrenches(self, tibia: Array, femur: Array) -> Array:
         """Return the wrenches (..., c, 6) on the insert at a force of one newton in each line.
 
-        Args:
-            tibia: pose of the tibia link in the insert frame, shape (4, 4).
-            femur: poses of the femur link in the insert frame, shape (..., 4, 4).
+        `tibia` (4, 4) and `femur` (..., 4, 4) are poses of the links in the insert frame.
         """
         start = transform(tibia, self.shank)
         directions = np.einsum("...ij,cj->...ci", femur[..., :3, :3], self.thigh)
@@ -151,12 +143,7 @@ class MuscleShare:
         return (*line_loads, *unknowns.moment_pair("tibia", "femur", self._knee_reserve))
 
     def wrench(self, tibia: Array, femur: Array) -> Array:
-        """Return the wrench (..., 6) of these loads on the insert, about its origin.
-
-        Args:
-            tibia: pose of the tibia link in the insert frame, shape (4, 4).
-            femur: poses of the femur link in the insert frame, shape (..., 4, 4).
-        """
+        """Return the wrench (..., 6) of these loads on the insert; see `unit_wrenches`."""
         units = self.lines.unit_wrenches(tibia, femur)
         total = np.einsum("i,...ij->...j", self.force[self.crossing], units)
         total[..., 3:] += self._knee_reserve
@@ -188,11 +175,8 @@ def flexion_row(
 ) -> FlexionRow:
     """Return the knee's row of the static optimisation, with a taut extensor mechanism.
 
-    Args:
-        geometry: the frame with an extensor mechanism; the forces of other muscles are not used.
-        lines: lines of action of the muscles that cross the knee.
-        friction: Coulomb coefficient of the femorotibial contact.
-        lifted: sides that carry no load.
+    `geometry` has an extensor mechanism; the forces of its other muscles are not used. `friction`
+    is the femorotibial coefficient, `lifted` the sides without load.
 
     Raises:
         ComputationError: the patella was not found, or the equations are singular.
@@ -220,11 +204,8 @@ def yielding_flexion_row(
     By the patella's equilibrium the tension of the extensor group is Q = a T + b, where T is the
     tension of the patellar ligament.
 
-    Args:
-        geometry: the frame with an extensor mechanism; its contact is not used.
-        lines: lines of action of the muscles that cross the knee.
-        base: tension of the patellar ligament without the other muscles, N.
-        per_wrench: change of that tension per wrench on the insert, shape (6,), 1 and 1/m.
+    `geometry` has an extensor mechanism; its contact is not used. `base` is T without the other
+    muscles, N, and `per_wrench` (6,), 1 and 1/m, its change per wrench on the insert.
 
     Raises:
         ComputationError: the equations of the patella are singular.
@@ -281,12 +262,8 @@ def condyle_contributions(
 ) -> dict[str, dict[str, float]]:
     """Return side -> load -> its contribution to the normal force of that side, N.
 
-    The contributions to a side add up to its normal force.
-
-    Args:
-        geometry: a frame with contact, extensor mechanism and the other muscles.
-        loads: solution of the frame; a lifted side has no contributions.
-        friction: Coulomb coefficient of the femorotibial contact.
+    They add up to that force; a lifted side has none. `geometry` has contact, extensor mechanism
+    and the other muscles.
     """
     share, extensor = geometry.share, geometry.extensor
     if share is None or extensor is None or loads.problems:

@@ -26,10 +26,9 @@ forces adds J_j^T df_j for each joint j with its Jacobian J_j:
     da/dq = (da/dq)_f + M^-1 sum_j J_j^T df_j/dq,
     dtau/dq = (dtau/dq)_f - sum_j J_j^T df_j/dq.
 
-All derivatives by q are in the tangent space: q changes as by `pin.integrate(model, q, dq)`. v is
-constant in the axes of the joints. The contact's tangent, ligaments, friction and straight muscle
-lines are analytic. The derivatives of the extensor mechanism by the pose of the femur and by c are
-inner central differences of its closed forms (no search is repeated).
+All derivatives by q are in the tangent space (`pin.integrate(model, q, dq)`), with v constant in
+the axes of the joints. Those of the extensor mechanism by the femur's pose and c are inner central
+differences of its closed forms (no search is repeated); all others are analytic.
 
 Reference: Carpentier & Mansard, Analytical derivatives of rigid body dynamics algorithms, RSS
 (2018), doi:10.15607/RSS.2018.XIV.038.
@@ -78,10 +77,9 @@ class RelativeTwists:
     """Twists of the knee's bodies per joint velocity, in the insert frame of the user's knee.
 
     Args:
-        femur: xi of the femur relative to the insert, shape (6, nv).
+        femur: xi relative to the insert, shape (6, nv).
         patella: xi of the link "patella" relative to the insert, shape (6, nv).
-        coordinates: derivative of the patella's coordinates, shape (3, nv); None: the model has no
-            patella.
+        coordinates: derivative of the patella's coordinates, shape (3, nv), if the model has one.
     """
 
     femur: Array
@@ -211,14 +209,7 @@ def _between(
 def twist_derivative(knee: "Knee", data: Any, femur: Array, q: Array, v: Array) -> Array:
     """Return the derivative (6, nv) of the femur's twist relative to the insert by q, at v.
 
-    The twist is in the insert frame of the user's knee.
-
-    Args:
-        knee: the knee.
-        data: Pinocchio data with placements and velocities at q and v.
-        femur: twist of the femur relative to the insert per joint velocity, shape (6, nv).
-        q: configuration, shape (nq,).
-        v: velocity, shape (nv,).
+    The twist is in the insert frame of the user's knee; `femur` is it per joint velocity, (6, nv).
     """
     model, bridge = knee.model, knee.bridge
     if len(model.mimicking_joints):
@@ -398,10 +389,7 @@ def _edge_free(values: Callable[[Array], Array], sizes: Array, step: float) -> A
 def generalised(model: Any, data: Any, changes: Array) -> Array:
     """Return sum_j J_j^T df_j (nv, k) of changes df (njoints, 6, k) of the joints' forces.
 
-    Args:
-        model: the user's model.
-        data: Pinocchio data after `pin.computeJointJacobians`.
-        changes: derivative of each joint's force in its joint's frame.
+    `data` is that after `pin.computeJointJacobians`; each change is in its joint's frame.
     """
     total = np.zeros((model.nv, changes.shape[2]))
     for joint in 1 + np.flatnonzero(changes[1:].any(axis=(1, 2))):

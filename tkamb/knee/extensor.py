@@ -31,13 +31,8 @@ Rates = Callable[[Array, Array], tuple[Array, Array, Array]]
 class ExtensorParts:
     """The parts of the extensor mechanism of a knee.
 
-    Args:
-        muscle: the muscle that pulls the patella.
-        ligament: the patellar ligament.
-        chain: chain of the knee.
-        femoral: surface of the femoral component, in the femur link's frame.
-        button: surface of the patellar button, in the patella link's frame.
-        insert: surface of the insert, in the insert frame; None: the ligament is straight.
+    Surfaces are in the frame of their link (femur, patella, insert). Without the insert's surface
+    the ligament is straight.
     """
 
     muscle: Muscle
@@ -58,14 +53,8 @@ class Posed(Protocol):
 class ExtensorLines:
     """Muscle, patella and patellar ligament of a knee, at any pose of the femur.
 
-    Args:
-        parts: the mechanism.
-
-    Attributes:
-        muscle: line of action of the muscle.
-        ligament: line of action of the patellar ligament.
-        mechanism: input of the search for the patella.
-        prepared: the patellofemoral contact; objects with the same surfaces share it.
+    `mechanism` is the input of the search for the patella. Objects with the same surfaces share the
+    `prepared` patellofemoral contact.
 
     Raises:
         InputError: a line starts inside the bone that it wraps.
@@ -83,10 +72,7 @@ class ExtensorLines:
     ) -> PatellaState:
         """Return the patella at given coordinates (3,) with the femur at a pose (4, 4).
 
-        Args:
-            pose: pose of the femur in the insert frame.
-            coordinates: coordinates of the patella, m and rad.
-            contact: the patellofemoral contact at these coordinates; None: it is computed.
+        Without a `contact` at these coordinates (m and rad) it is computed.
         """
         contact = self.mechanism.contact.at(coordinates) if contact is None else contact
         return patella_at(self.mechanism, pose, coordinates, contact)
@@ -96,11 +82,8 @@ class ExtensorLines:
     ) -> PatellaState:
         """Return the patella in equilibrium.
 
-        Args:
-            pose: pose_femur_in_insert, shape (4, 4).
-            guess: the patella at a similar pose, as initial guess.
-            near: coordinates as initial guess if `guess` is None, shape (3,), m and rad; None: the
-                search covers all rotations.
+        `guess` is the patella at a similar pose, or else `near` its coordinates (3,), m and rad, as
+        initial guess. Without either the search covers all rotations.
         """
         if guess is None or not guess.status.found:
             return solve_patella(self.mechanism, pose, near)
@@ -111,10 +94,7 @@ class ExtensorLines:
     ) -> tuple[Extensor, Unknown]:
         """Return the mechanism and its muscle, for the equations of one frame.
 
-        Args:
-            flexion: flexion, for messages, rad.
-            state: the chain at that frame.
-            patella: the patella at that frame.
+        `flexion` (rad) is for messages.
 
         Raises:
             ComputationError: the patella was not found, or an end of a line lies inside the
@@ -144,15 +124,9 @@ class ExtensorLines:
     ) -> list[PointForces]:
         """Return the loads of a muscle tension on femur, patella and tibia.
 
-        The patella is massless: the patellofemoral force balances the two tensions.
-
-        Args:
-            poses: link -> pose (4, 4) in the insert frame.
-            patella: the patella at these poses.
-            flexion: flexion, for messages, rad.
-            tension: tension of the muscle, N.
-            patellar_tension: tension of the patellar ligament, N; None: from the patella's
-                equilibrium.
+        The patella is massless: the patellofemoral force balances the two tensions (N). Without a
+        `patellar_tension` the patella's equilibrium gives it. `poses` (4, 4) are in the insert
+        frame; `flexion` (rad) is for messages.
 
         Raises:
             ComputationError: the patella was not found, or its equilibrium has a force of the wrong
@@ -204,12 +178,10 @@ class ExtensorLines:
         return Line("patellar_ligament", (ligament.proximal, ligament.distal), wrap)
 
     def _tibia_in_insert(self) -> Array:
-        """Return the pose of the link of the ligament's distal end in the insert frame."""
         on_tibia = self._chain.link_in(self._parts.ligament.distal.link, "tibia")
         return inverse(self._chain.insert_in_tibia) @ on_tibia
 
     def _check_fixed_ends(self) -> None:
-        """Raise an error if a fixed end of a line lies inside the outline that the line wraps."""
         ends, name = [], self.muscle.name
         if self.muscle.wrap is not None:
             last = self.muscle.points[self.muscle.wrap.segment]
@@ -232,7 +204,6 @@ class ExtensorLines:
                 )
 
     def _build_mechanism(self) -> tuple[ExtensorMechanism, PatellofemoralContact]:
-        """Return the mechanism, and its prepared contact."""
         parts, chain = self._parts, self._chain
         segment = off_femur(self.muscle.points, chain)
         origin, insertion = self.muscle.points[segment : segment + 2]
@@ -256,16 +227,14 @@ class ExtensorFrames:
     """The patella over the frames of a motion.
 
     Args:
-        lines: the extensor mechanism.
         time: times of the frames, shape (f,), s.
         poses: pose_femur_in_insert, shape (f, 4, 4).
         recorded: patella coordinates, rates and accelerations, shape (f, 3, 3); None: the patella
             is solved.
-        rates: function of time (n,) and coordinates (n, 3). It returns the filtered coordinates
-            and their first and second derivatives.
+        rates: function of time (n,) and coordinates (n, 3). It returns the filtered coordinates and
+            their first and second derivatives.
 
     Attributes:
-        lines: the extensor mechanism.
         states: the patella at each frame; a recorded patella is evaluated at first use.
 
     Raises:
@@ -296,18 +265,10 @@ class ExtensorFrames:
     ) -> "ExtensorFrames":
         """Return the patella for slightly changed lines or poses of the femur.
 
-        In the given frames the equilibrium is solved again, with the last one as initial guess. A
-        solved patella moves there. A recorded patella moves from the recorded coordinates by the
-        change of the equilibrium: its distance from the equilibrium stays that of the recording. It
-        is lost if one of the two equilibria does not exist. The rates and all other frames do not
-        change.
-
-        Args:
-            lines: the changed mechanism.
-            poses: changed pose_femur_in_insert, shape (f, 4, 4).
-            frames: frames in which the patella moves.
-            recorded: recorded coordinates, possibly changed, shape (f, 3), m and rad; None: the
-                patella is solved.
+        In the given frames the equilibrium is solved again, from the last one. A solved patella
+        moves there. A recorded patella moves from `recorded` (f, 3), possibly changed coordinates,
+        by the change of the equilibrium: its distance from it stays. It is lost if one of the two
+        equilibria does not exist. The rates and all other frames do not change.
         """
         other = copy.copy(self)
         other.lines, other._joints = lines, self._joints.copy()
@@ -357,8 +318,8 @@ class ExtensorFrames:
     def patella(self, k: int, pose: Array, guess: PatellaState | None = None) -> PatellaState:
         """Return the patella of frame k with the femur at another pose (4, 4).
 
-        A recorded patella keeps its coordinates. A solved patella is solved again; the initial
-        guess is `guess` or the patella at the recorded pose.
+        A recorded patella keeps its coordinates. A solved one is solved again, from `guess` or the
+        patella at the recorded pose.
         """
         mechanism = self.lines.mechanism
         frame_state = self.states[k]
@@ -380,11 +341,10 @@ class ExtensorFrames:
     def _differentiate(self, time: Array, poses: Array, rates: Rates) -> Array:
         """Return the solved coordinates with their rates (f, 3, 3); NaN: the patella is lost.
 
-        Only rates and accelerations are filtered. At filtered coordinates the button would not
-        touch the femur and the moments would not balance.
-
-        The filter needs coordinates in lost frames: a shape-preserving cubic interpolates them. An
-        error of 1 m/s² changes the inertial force of a patella of 0.1 kg by 0.1 N.
+        Only rates and accelerations are filtered: at filtered coordinates the button would not
+        touch the femur and the moments would not balance. In lost frames, which the filter needs, a
+        shape-preserving cubic interpolates. An error of 1 m/s² changes the inertial force of a
+        patella of 0.1 kg by 0.1 N.
         """
         coordinates = np.array([state.coordinates for state in self.states])
         solved_frames = np.flatnonzero(np.isfinite(coordinates).all(axis=1))
@@ -412,12 +372,7 @@ class ExtensorFrames:
 
 @dataclass(frozen=True, eq=False)
 class PatellaOfFrame:
-    """Finds the patella in one frame of a motion.
-
-    Args:
-        frames: the patella over all frames.
-        k: number of the frame.
-    """
+    """Finds the patella in one frame k of a motion."""
 
     frames: ExtensorFrames
     k: int
@@ -436,25 +391,18 @@ class PatellaOfFrame:
 
 @lru_cache(maxsize=1)
 def _patellar_contact(femoral: Surface, button: Surface, joint: bytes) -> PatellofemoralContact:
-    """Return the prepared contact of two surfaces, cached for the many samples of a scene.
+    """Return the prepared contact of two surfaces, cached by their identity for a scene's samples.
 
-    The cache compares the identity of the surfaces.
-
-    Args:
-        femoral: femoral component, femur link's frame.
-        button: patellar button, patella link's frame.
-        joint: bytes of pose_joint_in_femur (4, 4).
+    The surfaces are in the frames of the links; `joint` are bytes of pose_joint_in_femur (4, 4).
     """
     joint_in_femur = np.frombuffer(joint).reshape(4, 4)
     return PatellofemoralContact(femoral.moved(inverse(joint_in_femur)), button)
 
 
 class _RecordedContacts:
-    """The patellofemoral contact at recorded coordinates, computed at first use.
+    """The patellofemoral contact at recorded coordinates (f, 3), computed at first use.
 
-    Args:
-        contact: contact of the two surfaces, without stored distances.
-        coordinates: recorded coordinates of the patella, shape (f, 3), m and rad.
+    `contact` is without stored distances.
     """
 
     def __init__(self, contact: PatellofemoralContact, coordinates: Array) -> None:
@@ -469,13 +417,9 @@ class _RecordedContacts:
 
 @lru_cache(maxsize=1)
 def _recorded_contacts(prepared: PatellofemoralContact, coordinates: bytes) -> _RecordedContacts:
-    """Return the contacts at recorded coordinates. They do not depend on the knee's pose.
+    """Return the contacts at recorded coordinates (bytes), which do not depend on the knee's pose.
 
     The cache compares the identity of the prepared contact.
-
-    Args:
-        prepared: the prepared contact.
-        coordinates: bytes of the coordinates (f, 3), m and rad.
     """
     return _RecordedContacts(prepared.unused(), np.frombuffer(coordinates).reshape(-1, 3))
 
@@ -520,7 +464,6 @@ class _RecordedStates(Sequence[PatellaState]):
 
 
 def _solve_all(mechanism: ExtensorMechanism, poses: Array) -> list[PatellaState]:
-    """Return the patella at each frame, with the previous frame as initial guess."""
     states: list[PatellaState] = []
     for pose in poses:
         initial_guess = (states[-1].coordinates, states[-1].slopes) if states else ()
@@ -529,8 +472,6 @@ def _solve_all(mechanism: ExtensorMechanism, poses: Array) -> list[PatellaState]
 
 
 class _Poses:
-    """Poses of links in the insert frame, as a `Posed` object."""
-
     def __init__(self, poses: Mapping[str, Array]) -> None:
         self._poses = poses
 

@@ -5,15 +5,14 @@ The ellipsoid is Σ x²/a² = 1 with the gradient g = x/a². A geodesic x(s) of 
     x'' = -(v·(v/a²) / g·g) g.
 
 A neighbouring geodesic at the distance j obeys j'' = -K j (the Jacobi field), with the Gaussian
-curvature K = 1/(a₁a₂a₃ g·g)². A string from a point P to a point Q first touches the ellipsoid on
-the contour of P, the closed curve of points with tangent planes through P. The unknowns are the
-angle φ along the contour and the length s of the geodesic. Two equations state that the tangent at
-the end of the geodesic passes through Q. Newton's method solves them; j gives the derivatives.
+curvature K = 1/(a₁a₂a₃ g·g)². A string from P to Q first touches the ellipsoid on the contour of P,
+whose tangent planes pass through P. The unknowns are the angle φ along the contour and the length s
+of the geodesic; the tangent at its end must pass through Q. Newton's method solves these two
+equations, with derivatives from j.
 
-An affine map of the ellipsoid to the unit sphere keeps straight lines and tangency. On the sphere,
-contours and plane sections are circles. The initial guess is the shortest string in any plane
-through P and Q. On the circle of such a plane, the touching points of a taut string have a closed
-form. Its length is measured on the ellipsoid.
+An affine map of the ellipsoid to the unit sphere keeps straight lines and tangency. There, contours
+and plane sections are circles, and touching points of a taut string in a plane have a closed form.
+The initial guess is the string in any plane through P and Q that is shortest on the ellipsoid.
 
 Reference: Scholz et al., Multibody Syst Dyn 36:195 (2016), doi:10.1007/s11044-015-9451-1, for
 Newton's method with Jacobi fields.
@@ -54,11 +53,8 @@ def planar_starts(
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Return, for each p and q, the shortest string in a plane and the next local minimum.
 
-    Args:
-        p: starts of the strings, with the ellipsoid scaled to the unit sphere, shape (f, 3).
-        q: ends of the strings, scaled in the same way, shape (f, 3).
-        axes: semi-axes, m, shape (3,).
-        half: as in `shortest_strings`.
+    p and q (f, 3) are ends of strings, with the ellipsoid scaled to the unit sphere; `half` as in
+    `shortest_strings`.
 
     Returns:
         Points where the two strings meet the sphere, shape (f, 2, 3). Their lengths on the
@@ -96,7 +92,6 @@ class _Planes:
         along: direction of the line, shape (f, 1, 3).
         outward: direction in the half plane, normal to the line, shape (f, k, 3).
         centre: centre of the circle, shape (f, k, 3).
-        radius: radius of the circle, shape (f, k).
         ends: angles from `outward` towards `along` at which the taut string meets and leaves the
             circle, rad, shape (2, f, k).
     """
@@ -131,7 +126,6 @@ class _Planes:
         return cls(along[:, None], outward, centre, radius, np.stack(ends))
 
     def chosen(self, rows: NDArray[np.int64], planes: NDArray[np.int64]) -> "_Planes":
-        """Return the chosen planes of each line."""
         return _Planes(
             self.along,
             self.outward[rows, planes],
@@ -148,14 +142,7 @@ class _Planes:
         return cosine[..., None] * outward + sine[..., None] * along + self.centre[:, :, None]
 
     def speeds(self, places: Array, axes: Array) -> Array:
-        """Return the lengths (f, k, n), m, of the arcs' tangents on the ellipsoid.
-
-        A tangent is the derivative of a point of the arc by the parameter.
-
-        Args:
-            places: parameters of points on the arcs, from -1 to 1, shape (n,).
-            axes: semi-axes of the ellipsoid, m, shape (3,).
-        """
+        """Return the lengths (f, k, n), m, of the arcs' tangents by parameter, on the ellipsoid."""
         angle, along, outward = self._angles(places), self.along * axes, self.outward * axes
         cosine, sine = np.cos(angle), np.sin(angle)
         squared = cosine**2 * dot(along, along)[..., None]
@@ -165,7 +152,6 @@ class _Planes:
         return size[..., None] * np.sqrt(np.maximum(squared, 0.0))
 
     def _angles(self, places: Array) -> Array:
-        """Return the angles (f, k, n), rad, at parameters `places` (n,) of the arcs."""
         middle, half = 0.5 * (self.ends[0] + self.ends[1]), 0.5 * (self.ends[1] - self.ends[0])
         return middle[..., None] + half[..., None] * places
 
@@ -246,13 +232,9 @@ def shortest_strings(start: Array, end: Array, axes: Array, half: Array | None =
 def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) -> Strings:
     """Return the strings that Newton's method finds from initial guesses.
 
-    Args:
-        start: starts of the strings, m, shape (f, 3).
-        end: ends of the strings, m, shape (f, 3).
-        axes: semi-axes, m, shape (3,).
-        contour: initial points on the contour, with the ellipsoid scaled to the unit sphere,
-            shape (f, 3).
-        pieces: initial lengths of the s steps along the geodesic, m, shape (f, s).
+    Starts and ends (f, 3), m. `contour` (f, 3) are initial points on the contour, with the
+    ellipsoid scaled to the unit sphere, `pieces` (f, s), m, initial lengths of steps along the
+    geodesic.
     """
     p = start / axes
     squared = (p**2).sum(axis=1, keepdims=True)
@@ -311,9 +293,7 @@ class _Shot:
     def fire(self, angle: Array, pieces: Array) -> tuple[Array, Array, Array, Array, Array]:
         """Return the errors of geodesics and their derivatives.
 
-        Args:
-            angle: angles along the contour, rad, shape (f,).
-            pieces: lengths of the steps along the geodesic, m, shape (f, s).
+        `angle` (f,), rad, is along the contour, `pieces` (f, s), m, are steps along the geodesic.
 
         Returns:
             Residuals (f, 2); their derivatives (f, 2, 2) by angle and length; entry and exit
@@ -371,7 +351,6 @@ def _follow_geodesics(
     Args:
         states: (x, v, j, j') at the starts, replaced by the values at the ends, shape (f, 8).
         pieces: lengths of the steps, m, shape (f, s).
-        axes: semi-axes, m, shape (3,).
         weights: weights of the earlier stages in each of the k stages, shape (k, k).
         last_weights: weights of the stages in a step, shape (k,).
     """

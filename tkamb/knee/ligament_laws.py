@@ -7,8 +7,8 @@ L is the length, L0 the slack length, eps = (L - L0)/L0 the strain, and eps1 = 0
     F = (k/2) (L - L0)         eps <= 2 eps1    F = k eps²/(4 eps1)        eps <= 2 eps1
     F = k (L - (1 + eps1) L0)  otherwise        F = k (eps - eps1)         otherwise
 
-Both laws are continuous. The slope of the two-line law jumps at 2 eps1; the slope of the quadratic
-toe does not. Another package offers a law through the entry-point group `tkamb.ligaments`:
+The slope of the two-line law jumps at 2 eps1. Another package offers a law through the entry-point
+group `tkamb.ligaments`:
 
     [project.entry-points."tkamb.ligaments"]
     my-law = "my_package.my_module:MyLaw"
@@ -86,7 +86,7 @@ class LigamentLaw(ABC):
     def scaled(self, size: float) -> Self:
         """Return the law of a knee that is `size` times as large, of the same tissue.
 
-        Tensions become size² times as large. Lengths become size times as large, strains do not.
+        Tensions become size² times as large, lengths size times; strains do not change.
         """
         return self.stiffened(size if self.unit == "N/m" else size**2)
 
@@ -139,7 +139,6 @@ class QuadraticToe(LigamentLaw):
 
 
 def _by_region(strain: Array, toe: Array, line: Array) -> Array:
-    """Return zero for a slack bundle, else the value of the toe or of the line."""
     return np.where(strain <= 0.0, 0.0, np.where(strain <= 2.0 * TOE_STRAIN, toe, line))
 
 
@@ -182,11 +181,7 @@ def law_name(law: LigamentLaw) -> str:
 
 @dataclass(frozen=True, eq=False)
 class StackedLaws:
-    """The laws of m bundles, computed together.
-
-    Args:
-        groups: indices of the bundles of one class, and their law with arrays as fields.
-    """
+    """The laws of m bundles, computed together: indices of each class, and its law with arrays."""
 
     groups: tuple[tuple[NDArray[np.intp], Any], ...]
 
@@ -218,7 +213,6 @@ class StackedLaws:
 
 
 def _stacked(laws: Sequence[LigamentLaw]) -> LigamentLaw:
-    """Return a law whose fields are the arrays of the fields of laws of one class."""
     law = copy.copy(laws[0])
     for field in fields(law):
         object.__setattr__(law, field.name, np.array([getattr(one, field.name) for one in laws]))

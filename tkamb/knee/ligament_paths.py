@@ -1,9 +1,9 @@
 """Taut paths of ligament bundles over surfaces, and their pulls on the links.
 
 Let L be the length of the shortest path over the surfaces (`tkamb.knee.taut_strings`), and T its
-tension. No friction acts, so that T is constant along the path. The wrench on a link is -T dL/dx
-for a displacement x of this link: the tension pulls along the straight parts at their ends and
-presses on a surface where the path meets and leaves it. The sum of all wrenches is zero.
+tension, constant along the path without friction. The wrench on a link is -T dL/dx for its
+displacement x: the tension pulls along the straight parts at their ends and presses on a surface
+where the path meets and leaves it. The sum of all wrenches is zero.
 
 If an end of the path moves into an ellipsoid, the ellipsoid shrinks with this end, so that L is
 continuous. There is no path if an end lies inside a cylinder, a sphere or a section.
@@ -44,9 +44,7 @@ class BundlePaths:
 def bundle_paths(bundles: Sequence["Ligament"], poses: Mapping[str, Array]) -> BundlePaths:
     """Return the taut paths of bundles between the same two links over the same surfaces.
 
-    Args:
-        bundles: n bundles with surfaces.
-        poses: link -> pose of the link in the frame of the result, shape (..., 4, 4).
+    `poses` (..., 4, 4) are those of the links in the frame of the result.
     """
     links, wraps = bundles[0].links, bundles[0].wraps
     placed = np.broadcast_arrays(*(np.asarray(poses[link], float) for link in links))
@@ -121,7 +119,6 @@ def taut_wrenches(
 
 
 def _points(ends: Array, strings: WrappedStrings, rows: Index) -> Array:
-    """Return the points (f, 2 + 2w, 3) of `BundlePaths`."""
     place, points = ends[0], [ends[0]]
     for gap in range(strings.order.shape[1]):
         touched = strings.order[:, gap]

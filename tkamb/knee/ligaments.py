@@ -3,9 +3,9 @@
 `tkamb.knee.ligament_laws` has the laws: tension by length.
 
 `generic_ligaments` scales a set of bundles to the implant, for a patient without measured
-ligaments. Positions of the femoral ends are relative to the axis of the posterior condyles, because
-collaterals are nearly isometric near this axis. The proportions are those of an average knee: check
-the strain table before using any force.
+ligaments. Femoral ends are relative to the axis of the posterior condyles, near which collaterals
+are nearly isometric. The proportions are those of an average knee: check the strain table before
+using any force.
 
 References: Abdel-Rahman & Hefzy, Med Eng Phys 20:276 (1998) (stiffness); Blankevoort & Huiskes,
 J Biomech Eng 113:263 (1991), doi:10.1115/1.2894883 (strains at extension).
@@ -37,8 +37,7 @@ MAX_REFERENCE_DISTANCE = 15.0 * DEGREE
 class Ligament:
     """One bundle between a point of one link and a point of another, straight or over surfaces.
 
-    Tension acts along the taut path (`tkamb.knee.ligament_paths`). It pulls both ends, and presses
-    on the links of the surfaces that the path touches, so that all forces balance.
+    Tension acts along the taut path (`tkamb.knee.ligament_paths`).
 
     Args:
         name: name of the bundle.
@@ -74,11 +73,7 @@ class Ligament:
             raise InputError(f"{self.law!r} is no law", f"ligament {self.name}", hint)
 
     def ends(self, poses: Mapping[str, Array]) -> tuple[Array, Array]:
-        """Return proximal and distal end (..., 3), m, in the insert frame.
-
-        Args:
-            poses: link -> pose_link_in_insert, shape (4, 4) or (f, 4, 4).
-        """
+        """Return proximal and distal end (..., 3), m, in the insert frame."""
         proximal = transform(poses[self.proximal.link], self.proximal.position)
         return proximal, transform(poses[self.distal.link], self.distal.position)
 
@@ -89,11 +84,7 @@ class Ligament:
         return tuple(dict.fromkeys((self.proximal.link, self.distal.link, *bodies)))
 
     def on_links(self, placed: Mapping[str, tuple[str, Array]]) -> "Ligament":
-        """Return the same bundle with ends and surfaces given on other links.
-
-        Args:
-            placed: link -> another link that moves with it, and pose_link_in_other (4, 4).
-        """
+        """Return the bundle on other links (link -> other, pose_link_in_other) that move alike."""
 
         def point(end: LinkPoint) -> LinkPoint:
             link, pose = placed[end.link]
@@ -103,11 +94,7 @@ class Ligament:
         return replace(self, proximal=point(self.proximal), distal=point(self.distal), wraps=wraps)
 
     def points(self, poses: Mapping[str, Array]) -> Array:
-        """Return points (..., n, 3), m, along the path in the insert frame, ends included.
-
-        Args:
-            poses: link -> pose_link_in_insert, shape (4, 4) or (f, 4, 4).
-        """
+        """Return points (..., n, 3), m, along the path in the insert frame, ends included."""
         if self.wraps:
             from tkamb.knee.ligament_paths import bundle_paths  # imports numba
 
@@ -145,12 +132,9 @@ DIFFERENCE_ARM = 0.03
 class BundleArrays:
     """Bundles between two bodies: arrays of m straight bundles, and the bundles that wrap.
 
-    All proximal ends share one frame, and all distal ends share one frame.
-
     Args:
-        proximal: proximal ends, shape (m, 3), m.
-        distal: distal ends, shape (m, 3), m.
-        laws: their laws.
+        proximal: proximal ends in one frame, shape (m, 3), m.
+        distal: distal ends in one frame, shape (m, 3), m.
         slack_length: slack lengths, shape (m,), m.
         wrapping: bundles that wrap, with the links `PROXIMAL` and `DISTAL`.
     """
@@ -181,12 +165,7 @@ class BundleArrays:
         )
 
     def pulls(self, proximal: Array, distal: Array) -> tuple[Array, Array]:
-        """Return tensions (..., m), N, and forces (..., m, 3), N, on distal ends.
-
-        Args:
-            proximal: proximal ends, shape (..., m, 3), m.
-            distal: distal ends in the same frame, shape (..., m, 3), m.
-        """
+        """Return tensions (..., m), N, and forces (..., m, 3), N, on distal ends."""
         along = proximal - distal
         length = np.sqrt((along * along).sum(axis=-1))
         tension = self.laws.tension(length, self.slack_length)
@@ -195,12 +174,9 @@ class BundleArrays:
     def tangent(self, pose: Array) -> Array:
         """Return the derivative (6, 6) of `wrench` by a small displacement of the proximal body.
 
-        The pull T u on a distal end changes by (T/L (I - u u^T) + T' u u^T) dx, where dx is the
-        displacement of the proximal end, L the length and T' the slope of the law. Bundles that
-        wrap have central differences.
-
-        Args:
-            pose: pose of the proximal frame in the distal frame, shape (4, 4).
+        The pull T u on a distal end changes by (T/L (I - u u^T) + T' u u^T) dx, with the
+        displacement dx of the proximal end, the length L and the slope T' of the law. Bundles that
+        wrap have central differences. `pose` is that of the proximal frame in the distal frame.
         """
         proximal = transform(pose, self.proximal)
         along = proximal - self.distal
@@ -222,10 +198,9 @@ class BundleArrays:
         return total
 
     def wrench(self, poses: Array) -> Array:
-        """Return the wrench (..., 6) on the body of the distal ends, about its frame's origin.
+        """Return the wrench (..., 6) on the distal body, about its frame's origin.
 
-        Args:
-            poses: pose of the proximal frame in the distal frame, shape (..., 4, 4).
+        `poses` (..., 4, 4) are those of the proximal frame in the distal frame.
         """
         proximal = self.proximal @ poses[..., :3, :3].swapaxes(-1, -2) + poses[..., None, :3, 3]
         _, pull = self.pulls(proximal, self.distal)
@@ -250,13 +225,8 @@ def ligament_loads(
 ) -> tuple[Array, tuple[PointForces, ...]]:
     """Return the tensions (n,), N, and the loads on the links; their sum is zero.
 
-    The forces on the two ends of a straight bundle are equal and opposite, along the line through
-    both ends. There is one load per link for all straight bundles, and one for all bundles that
-    wrap.
-
-    Args:
-        ligaments: the bundles.
-        poses: link -> pose_link_in_insert (4, 4).
+    There is one load per link for all straight bundles, and one for all that wrap. `poses` (4, 4)
+    are in the insert frame.
 
     Raises:
         ComputationError: a bundle has no taut path over its surfaces.
@@ -302,13 +272,9 @@ def build_ligaments(
 ) -> tuple[Ligament, ...]:
     """Return the bundles with slack lengths.
 
-    A missing slack length is computed from the reference strain eps_r, the strain in the frame
-    nearest to the reference flexion. With the length L_r in that frame, L0 = L_r/(1 + eps_r).
-
-    Args:
-        ligaments: the bundles.
-        poses: link -> pose_link_in_insert (f, 4, 4).
-        flexion: flexion in these frames, shape (f,), rad.
+    A missing slack length follows from the reference strain eps_r and the length L_r in the frame
+    nearest to the reference flexion: L0 = L_r/(1 + eps_r). `poses` (f, 4, 4) are in the insert
+    frame, `flexion` (f,) in rad.
 
     Raises:
         InputError: a link is unknown, both ends are the same point, or no recorded frame is near
@@ -365,15 +331,10 @@ def strain_table(
     """Return the strain of each bundle at a few flexions. An unlikely strain reveals a wrong end.
 
     Args:
-        ligaments: the bundles.
         poses: link -> pose_link_in_insert (f, 4, 4).
         flexion: flexion in these frames, shape (f,), rad.
         at_deg: flexions at which the strain is computed, in the nearest recorded frame, deg.
-        within_deg: largest difference of that frame's flexion, deg. At a larger difference the
-            strain is NaN.
-
-    Returns:
-        bundle -> strain at each flexion.
+        within_deg: largest difference of that frame's flexion, deg; beyond it the strain is NaN.
     """
     frames = [nearest_frame(flexion, angle * DEGREE) for angle in at_deg]
     is_near = [
@@ -413,14 +374,11 @@ _LATERAL = re.compile(
 def check_collateral_sides(ligaments: Iterable[Ligament], chain: Chain, side: str) -> None:
     """Raise an error if a ligament's name and its position belong to different sides of the knee.
 
-    Args:
-        ligaments: the bundles of a right knee, or of a left knee mirrored to a right one: z points
-            laterally.
-        chain: chain with the links of the bundles.
-        side: side of the patient's knee, for the message.
+    The bundles are those of a right knee or of a mirrored left one: z points laterally. `side` is
+    that of the patient's knee, for the message.
 
     Raises:
-        InputError: an end lies on the wrong side; the message names the bundle and the end.
+        InputError: an end lies on the wrong side.
     """
     for bundle in ligaments:
         sign = _lateral_sign(bundle.name)
@@ -444,7 +402,6 @@ def _lateral_sign(name: str) -> int:
 
 
 def _lateral_position(end: LinkPoint, chain: Chain) -> float:
-    """Return the lateral position (m) of an end in the frame of insert, femur or patella."""
     carrier = chain.carrier(end.link)
     position = transform(chain.link_in(end.link, carrier), end.position)
     if carrier == "tibia":
@@ -528,14 +485,10 @@ def generic_ligaments(
 def condylar_axis(femoral: Surface) -> Array:
     """Return the centre (3,) of the circle that fits the posterior condyles, m.
 
-    The centre lies on the condylar axis, which is parallel to z. At a flexion phi let u be the
-    downward direction in the femur's frame. The support of the component in this direction is the
-    maximum of u . p over the vertices p. A circle of centre c and radius r has the support
-    u . c + r. Least squares fit c and r to the supports at 20 to 100 deg of flexion. The z of the
-    centre is the middle of the component's width.
-
-    Args:
-        femoral: surface of the femoral component in the femur's frame.
+    The axis is parallel to z. At a flexion phi let u be downward in the femur's frame. The support,
+    the maximum of u . p over the vertices p, is u . c + r for a circle of centre c and radius r;
+    least squares fit c and r to those at 20 to 100 deg. The z of the centre is the middle of the
+    component's width.
     """
     flexion = np.deg2rad(np.arange(20.0, 101.0, 5.0))
     down = np.column_stack([-np.sin(flexion), -np.cos(flexion)])

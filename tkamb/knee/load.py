@@ -11,12 +11,7 @@ from tkamb.geometry.frames import Array, cross
 
 @dataclass(frozen=True, eq=False)
 class LinkPoint:
-    """A point fixed to a link.
-
-    Args:
-        link: name of the link.
-        position: position in the link's frame, shape (3,), m.
-    """
+    """A point fixed to a link: its name, and the position (3,), m, in its frame."""
 
     link: str
     position: Array
@@ -33,13 +28,12 @@ Point = LinkPoint | tuple[str, Sequence[float]]
 
 @dataclass(frozen=True, eq=False)
 class PointForces:
-    """Forces on one link, at one frame of the motion.
+    """Forces on one link, at one frame of the motion, insert frame.
 
     Args:
-        link: name of the link.
-        points: points of application, insert frame, shape (m, 3), m.
-        forces: forces, or forces per unit of an unknown magnitude, insert frame, shape (m, 3), N.
-        moment: free moment on the same link, insert frame, shape (3,), N·m.
+        points: points of application, shape (m, 3), m.
+        forces: forces, or forces per unit of an unknown magnitude, shape (m, 3), N.
+        moment: free moment on the same link, shape (3,), N·m.
     """
 
     link: str

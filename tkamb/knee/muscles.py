@@ -48,10 +48,8 @@ class SagittalWrap:
     def outline(self, part: "Surface", middle: float, below: float = np.inf) -> Array:
         """Return the convex outline (n, 2), m, of part and bone, offset by `half_thickness`.
 
-        Args:
-            part: surface of the part. The outline lies in the x-y plane of its frame.
-            middle: z of the line in that frame, m.
-            below: largest y, m; the surfaces above it are ignored.
+        It lies in the x-y plane of the part's frame, below y = `below` (m); z of the line is
+        `middle`.
         """
         surfaces = [part] if self.bone is None else [part, self.bone]
         planes = middle + np.linspace(-self.band, self.band, SECTIONS)
@@ -155,10 +153,9 @@ class Line:
         )
 
     def loads(self, path: "TautPath") -> tuple[PointForces, ...]:
-        """Return the forces of a unit tension on the links. Their sum is zero.
+        """Return the forces of a unit tension on the links, the two ends first. Their sum is zero.
 
-        The tension pulls both ends along the path. The force at an inner point or corner is the
-        change of direction. The two ends come first.
+        The force at an inner point or corner is the change of direction.
         """
         links = [point.link for point in self.points]
         if self.wrap:
@@ -194,10 +191,7 @@ def off_femur(points: Sequence[LinkPoint], chain: "Chain") -> int:
 def muscle_line(muscle: Muscle, chain: "Chain", femoral: "Surface") -> Line:
     """Return a muscle's line of action. It may wrap the femoral component in the patella's plane.
 
-    Args:
-        muscle: the muscle.
-        chain: chain of the knee.
-        femoral: surface of the femoral component in the femur link's frame.
+    `femoral` is in the femur link's frame.
     """
     if muscle.wrap is None:
         return Line(muscle.name, muscle.points)
@@ -214,8 +208,7 @@ def muscle_line(muscle: Muscle, chain: "Chain", femoral: "Surface") -> Line:
 def check_muscles(muscles: Sequence[Muscle], chain: "Chain") -> None:
     """Raise an error unless there is one muscle, from the femur to the patella.
 
-    With one muscle the equations of a frame are square. Equilibrium does not determine how several
-    muscles share the joint moments.
+    Equilibrium does not determine how several muscles share the joint moments.
 
     Raises:
         InputError: there are several muscles, or the muscle crosses no joint or inserts elsewhere.
@@ -255,12 +248,7 @@ class TensionLine:
     positions: tuple[Array, ...]
 
     def forces(self, data: Any, tension: float) -> list[tuple[int, pin.Force]]:
-        """Return pairs of a joint and the force on it, in the joint's frame.
-
-        Args:
-            data: Pinocchio data with joint placements up to date.
-            tension: tension, N.
-        """
+        """Return pairs of a joint and the force on it, in the joint's frame, at a tension (N)."""
         placements, points = self._points(data)
         steps = np.diff(points, axis=0)
         directions = steps / np.linalg.norm(steps, axis=1, keepdims=True)
@@ -291,13 +279,8 @@ class TensionLine:
         """Add the derivatives of `forces` by q to `changes` (njoints, 6, nv), tangent space.
 
         A segment of length l along u changes its direction by (I - u u^T) dx / l. In the joint's
-        axes a force R^T f changes by R^T df - omega x R^T f, and its point does not move.
-
-        Args:
-            model: the user's model.
-            data: Pinocchio data after `pin.computeJointJacobians`.
-            tension: tension, N.
-            changes: derivative of each joint's force in its joint's frame; changed in place.
+        axes a force R^T f changes by R^T df - omega x R^T f, and its point does not move. `data` is
+        that after `pin.computeJointJacobians`.
         """
         placements, points = self._points(data)
         spins, moves = [], []

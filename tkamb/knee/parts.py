@@ -45,22 +45,14 @@ MAX_LENGTH = 0.5
 
 
 def check_names(what: str, names: Sequence[str]) -> None:
-    """Raise an error if two lines have one name.
-
-    Raises:
-        InputError: see above.
-    """
+    """Raise an InputError if two lines have one name."""
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"two are named '{name}'", what, "give each its own name")
 
 
 def check_length(length: float, what: str, where: str) -> None:
-    """Raise an error if a length of a line is not positive, or is in millimetres.
-
-    Raises:
-        InputError: see above.
-    """
+    """Raise an InputError if a length of a line is not positive, or is in millimetres."""
     if not length > 0:
         raise InputError(f"{what} {length} m", where, f"give {what} in metres")
     if length > MAX_LENGTH:
@@ -142,12 +134,7 @@ def as_surface(mesh: Mesh, name: str, closed: bool = False) -> Surface:
     """Return a mesh in memory as a surface, m.
 
     Duplicate and degenerate triangles, wrong winding and small holes are repaired
-    (`tkamb.geometry.repair`).
-
-    Args:
-        mesh: a `Mesh`; a `Surface` is returned unchanged.
-        name: name of the mesh in messages.
-        closed: whether the mesh must enclose a volume.
+    (`tkamb.geometry.repair`). A `Surface` is returned unchanged; `name` is for messages.
 
     Raises:
         InputError: the mesh has no valid triangles, is not finite, is in millimetres, is not one
@@ -201,13 +188,7 @@ FRAME_TOLERANCE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """The implant's surfaces, mirrored for a left knee; None: not given.
-
-    Args:
-        femoral: surface of the femoral component, in the frame "femoral".
-        insert: surface of the insert.
-        button: surface of the patellar button, in the patella's frame.
-    """
+    """The implant's surfaces, mirrored for a left knee, in the frames of their parts."""
 
     femoral: Surface | None
     insert: Surface | None
@@ -397,9 +378,8 @@ _PREPARED: "weakref.WeakValueDictionary[str, KneeContact]" = weakref.WeakValueDi
 
 
 def _content(pair: "ContactPair", model: "ContactModel") -> str | None:
-    """Return the SHA-256 of all that a prepared contact depends on.
+    """Return the SHA-256 of all that a prepared contact depends on, settings included.
 
-    These are the meshes, material and bearing, the model with its options, and changed settings.
     None: the model cannot be pickled, so that its options are unknown.
     """
     parts = (model, pair.material, pair.bearing, pair.__dict__.get("split"), changed_settings())

@@ -1,8 +1,8 @@
 """Forces on a massless patella without friction, at a pose in the femur's sagittal plane.
 
-The pose has three coordinates: patella_ap, patella_si and patella_rotation. The forces of muscle,
-patellar ligament and contact are in equilibrium at every pose. Their moment vanishes only at the
-pose of equilibrium (`tkamb.knee.patella_search`).
+The three coordinates are patella_ap, patella_si and patella_rotation. The forces of muscle,
+patellar ligament and contact balance at every pose; their moment vanishes only at equilibrium
+(`tkamb.knee.patella_search`).
 """
 
 from dataclasses import dataclass
@@ -54,18 +54,16 @@ class PatellaState:
     Args:
         coordinates: patella_ap, patella_si (m) and patella_rotation (rad), shape (3,); NaN: not
             found.
-        contact_point: contact point, on the line of action of the contact force, insert frame,
-            shape (3,), m.
+        contact_point: on the line of action of the contact force, insert frame, shape (3,), m.
         contact_normal: unit normal from femur to patella in the femur's sagittal plane, insert
             frame, shape (3,).
         contact_on_patella: contact point in the patella's frame, shape (3,), m.
         gap: distance of button and femoral component, negative in penetration, m.
         ligament_ratio: patellar ligament tension per muscle tension, for a massless patella.
         patellofemoral_ratio: patellofemoral force per muscle tension, for a massless patella.
-        shift: first-order estimate of the mediolateral shift along z, m. The computed patella stays
-            in the sagittal plane.
-        tilt: first-order estimate of the tilt about y, rad.
-        status: how the search ended.
+        shift: first-order estimate of the mediolateral shift along z, m.
+        tilt: first-order estimate of the tilt about y, rad. The computed patella does not shift or
+            tilt.
         slopes: approximate derivatives of gap, ligament length and moment per unit tension (m) by
             the coordinates, shape (3, 3), as input of a later search; None: unknown.
     """
@@ -137,11 +135,7 @@ def patella_at(
 ) -> PatellaState:
     """Return the state of a patella at given coordinates, for any gap and residual moment.
 
-    Args:
-        mechanism: the extensor mechanism.
-        pose_femur_in_insert: pose of the femur, shape (4, 4).
-        coordinates: patella coordinates, shape (3,), m and rad.
-        contact: contact of the button at these coordinates.
+    `contact` is that of the button at these coordinates (3,), m and rad.
     """
     frame = PatellaFrame(mechanism, pose_femur_in_insert)
     balance = frame.balance_at(np.asarray(coordinates, float), contact)
@@ -150,12 +144,9 @@ def patella_at(
 
 
 def touching_patella(coordinates: Array, point: Array, normal: Array) -> PatellaState:
-    """Return the state of a patella from its coordinates and contact; all other values are NaN.
+    """Return the state of a patella from coordinates (3,), contact point and unit normal (3,).
 
-    Args:
-        coordinates: patella coordinates, shape (3,), m and rad.
-        point: contact point, insert frame, shape (3,), m.
-        normal: unit normal towards the patella, insert frame, shape (3,).
+    Both are in the insert frame; all other values are NaN.
     """
     nan = float("nan")
     on_patella = np.full(3, nan)

@@ -1,28 +1,27 @@
 """Contact of the patellar button with the femoral component, and line of action of its force.
 
-All positions are in the patellar joint's frame, x anterior, y superior, z right. This frame is
-fixed to the femur. The patella moves in its sagittal plane (x, y, rotation about z).
+All positions are in the patellar joint's frame, x anterior, y superior, z right, fixed to the
+femur. The patella moves in its sagittal plane (x, y, rotation about z).
 
-The articular side of the button is sampled. Sample i has the signed distance d_i from the femoral
-component, the nearest point p_i and the normal n_i at that point. The closest point of two faceted,
-nearly conforming surfaces jumps by centimetres from frame to frame. Therefore the contact of the
-left (-z) and of the right side of the patella is a weighted mean over the samples of that side,
-with weights w_i ~ exp(-d_i/tau):
+Sample i of the button's articular side has the signed distance d_i from the femoral component, the
+nearest point p_i and the normal n_i there. The closest point of two faceted, nearly conforming
+surfaces jumps by centimetres from frame to frame. Therefore the contact of the left (-z) and of the
+right side of the patella is a weighted mean over its samples, with weights w_i ~ exp(-d_i/tau):
 
     g = sum w_i d_i - tau,    p = sum w_i p_i,    n = sum w_i n_i
 
-For a paraboloid of any curvature, g is exactly the distance of the closest points. A patella in its
-groove touches on both sides. The left side carries the share lambda of the force. Soft tissue
-decides this share: per unit contact force, the patella shifts by c times the lateral force and
-tilts by d times the tilting moment:
+For a paraboloid of any curvature, g is exactly the distance of the closest points. In its groove a
+patella touches on both sides. Soft tissue decides the share lambda of the left side: per unit
+contact force, the patella shifts by c times the lateral force and tilts by d times the tilting
+moment:
 
     gap = min over 0 <= lambda <= 1 of
           lambda g_l + (1 - lambda) g_r + (c/2) n_z² + (d/2) a²
     n_z = lambda n_lz + (1 - lambda) n_rz      a = lambda z_l + (1 - lambda) z_r
 
 where z is measured from the patella's middle. The sagittal part of lambda n_l + (1 - lambda) n_r is
-the direction of the patellofemoral force. Shift and tilt are first-order estimates: the computed
-patella stays in the sagittal plane.
+the direction of the force. Shift and tilt are first-order estimates: the computed patella stays in
+the sagittal plane.
 """
 
 import copy
@@ -103,12 +102,11 @@ class PatellarContact:
 class PatellofemoralContact:
     """Contact between button and femoral component, prepared for many positions.
 
-    The distance of a sample is computed again only if the sample can have a weight at the new
-    position. The result does not change.
+    The distance of a sample is computed again only if it can have a weight; the result does not
+    change.
 
     Args:
-        femoral: surface of the femoral component in the patellar joint's frame, with shared
-            vertices.
+        femoral: surface in the patellar joint's frame, with shared vertices.
         patellar: surface of the button in the patella's frame; its articular side faces -x.
         ml: z of the patella's frame in the joint's frame, m.
         lateral_yield: c of the module's equations, m.
@@ -217,15 +215,12 @@ def _samples_to_update(
 ) -> Index:
     """Return the indices of the samples whose distances must be computed again.
 
-    Let d be the distance of a sample at its last evaluation, and m its displacement since then. The
-    new distance is between d - m and d + m. These bounds exclude samples without weight.
+    A distance d at the last evaluation is now between d - m and d + m, with the displacement m
+    since then. These bounds exclude samples without weight.
 
     Args:
         samples: present positions of the samples, shape (n, 3), m.
-        on_left: whether each sample is on the -z side, shape (n,).
-        sample_range: excess over the smallest distance above which a sample has no weight, m.
-        last_position: position of each sample at its last evaluation, shape (n, 3), m; inf: no
-            evaluation.
+        last_position: position of each sample at its last evaluation, shape (n, 3), m; inf: none.
         distance: signed distance at that position, shape (n,), m.
     """
     count, nearest = len(samples), np.full(2, np.inf)
@@ -262,23 +257,17 @@ def _store_samples(
     normal: Array,
     on_edge: Array,
 ) -> None:
-    """Store the distances, nearest points and normals of samples.
+    """Store the distances, nearest points and normals of m of the n samples.
 
     Args:
-        indices: indices of m samples, shape (m,).
+        indices: indices of the samples, shape (m,).
         samples: positions of all samples, shape (n, 3), m.
-        unsigned: unsigned distances of the m samples, shape (m,), m.
-        faces: triangle of each nearest point, shape (m,).
-        weights: barycentric coordinates of each nearest point, shape (m, 3).
-        triangles: triangles of the femoral component, shape (k, 3, 3), m.
+        unsigned: their unsigned distances, shape (m,), m, like `faces` and barycentric `weights`.
         smooth_normals: unit normals at the corners, shape (k, 3, 3). They jump at sharp edges.
-        vertex_normals: unit normals at the corners, means over each vertex, shape (k, 3, 3).
+        vertex_normals: the same as means over each vertex, shape (k, 3, 3).
         sharp: whether the edge opposite each corner is sharp or open, shape (k, 3).
-        last_position: output: positions of the samples, shape (n, 3), m.
-        distance: output: signed distances, shape (n,), m.
-        nearest_point: output: nearest points, shape (n, 3), m.
-        normal: output: unit normals at the nearest points, shape (n, 3).
-        on_edge: output: 1 if the nearest point is on a sharp or open edge, else 0, shape (n,).
+        last_position: output like all following, see `_samples_to_update`.
+        on_edge: 1 if the nearest point is on a sharp or open edge, else 0, shape (n,).
     """
     outward = np.empty(3)
     for m in range(len(indices)):
@@ -315,15 +304,8 @@ def _mean_over_sides(
 ) -> None:
     """Compute g, p, n and the share on edges of the left and the right side.
 
-    Args:
-        on_left: whether each sample is on the -z side, shape (n,).
-        depth: tau of the module's equations, m.
-        sample_range: excess over the smallest distance above which a sample has no weight, m.
-        distance: signed distances, shape (n,), m.
-        nearest_point: nearest points, shape (n, 3), m.
-        normal: unit normals at the nearest points, shape (n, 3).
-        on_edge: 1 if the nearest point is on a sharp or open edge, else 0, shape (n,).
-        means: output: the means of each side, shape (2, 8).
+    `depth` is tau; `on_edge` is 1 at a nearest point on a sharp or open edge, else 0, (n,); `means`
+    (2, 8) is the output.
     """
     for side in range(2):
         nearest, total = np.inf, 0.0
@@ -355,7 +337,7 @@ def _contact_of_sides(sides: Array, middle: float, compliances: Array, contact: 
     Args:
         sides: gap, point, normal and share on edges of the left and the right side, shape (2, 8).
         middle: z of the patella's middle, m.
-        compliances: c (m) and d (rad/m) of the module's equations, shape (2,).
+        compliances: c (m) and d (rad/m).
         contact: output: gap, share of the left, shift, tilt, share on edges, point (3,) and normal
             (3,) of the line of action in the sagittal plane, shape (`FIELDS`,).
     """

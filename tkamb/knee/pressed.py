@@ -74,11 +74,8 @@ def patella_of_user(
 ) -> KneePatellaResult:
     """Return a press of the button in the frames of the user's knee.
 
-    Args:
-        press: press of a right knee, with a contact.
-        poses: link -> pose (4, 4) in the insert frame.
-        in_patella: pose_button_in_patella (4, 4).
-        left: whether the knee is a left one.
+    `press` is that of a right knee, with a contact. `poses` (4, 4) are those of the links in the
+    insert frame, `in_patella` is pose_button_in_patella (4, 4).
     """
     assert press.contact is not None
     on_patella, femoral = pin.Force(press.on_patella), se3(poses["femur"])
@@ -153,7 +150,6 @@ class PressBatch:
     derivatives: "tuple[PressDerivatives, ...]" = ()
 
     def __repr__(self) -> str:
-        """Return the number of poses, of failures, and the largest peak pressure."""
         failed = sum(one.failed for one in self.results)
         peak = np.nanmax(self.peak_pressure, initial=0.0) / MEGAPASCAL
         return (
@@ -174,7 +170,7 @@ class PressBatch:
 def press_all(
     knee: "Knee", q: Array, load: float | Array, data: "KneeData", derivatives: bool
 ) -> PressBatch:
-    """Return the presses at q (n, nq) under one load, or a load per pose (n,), N.
+    """Return the presses at q (n, nq) under one load or a load per pose (n,), N.
 
     The warm start of each press is the press before it.
 

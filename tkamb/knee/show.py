@@ -128,7 +128,7 @@ _SEEN: "weakref.WeakSet[Any]" = weakref.WeakSet()
 def _look_at(window: Any, insert: Array, is_left: bool) -> None:
     """Move all that Python draws so that the knee is upright before the camera.
 
-    MeshCat's camera looks at the origin of its world, with z up; no message changes this. Its grid
+    No message moves MeshCat's camera, which looks at the origin of its world, with z up. Its grid
     and axes, which do not move, are hidden.
     """
     turn = np.column_stack([np.eye(3)[0], np.eye(3)[2], -np.eye(3)[1]])  # insert x, y, z
@@ -146,7 +146,6 @@ def _look_at(window: Any, insert: Array, is_left: bool) -> None:
 
 
 def _window(viewer: Any) -> tuple[Any, str]:
-    """Return the MeshCat window of a viewer, and its root node."""
     inner = getattr(viewer, "viewer", viewer)
     if not hasattr(inner, "set_object"):
         raise InputError(

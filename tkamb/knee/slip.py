@@ -1,16 +1,15 @@
 """Rolling and slipping of the femoral condyles on the insert, by arc lengths.
 
 From frame to frame the lowest point of a condyle moves by an arc a_f on the femoral surface, and
-the projection of this point moves by an arc a_i on the insert. The arcs lie in the insert's
-sagittal plane. They are positive if the contact moves backwards, as in flexion. In rolling the two
-arcs are equal. Axial rotation about the geometric centre of the femoral component causes the part
-a_axial of a_i:
+its projection by an arc a_i on the insert, both in the insert's sagittal plane and positive if the
+contact moves backwards, as in flexion. In rolling they are equal. Axial rotation about the
+geometric centre of the femoral component causes the part a_axial of a_i:
 
     slip = sum (a_f - (a_i - a_axial)),   a_axial = d(alpha) (z_condyle - z_centre) / cos(slope)
 
-alpha is positive if the femur rotates externally. Slip is positive if the femur's surface slides
-forwards on the insert. The rate of the slip is the x velocity of the femur's contact point relative
-to the insert, without the axial part. `sliding_velocity` computes this rate without arcs.
+alpha is positive if the femur rotates externally, slip if the femur's surface slides forwards on
+the insert. The rate of the slip is the x velocity of the femur's contact point relative to the
+insert, without the axial part; `sliding_velocity` computes it without arcs.
 
 If the tangent of a profile turns by d between two points, the arc is chord (d/2)/sin(d/2). This is
 exact on a circle. On other profiles the error is of third order in the step.
@@ -55,21 +54,16 @@ class CondyleSlip:
 
 
 class InsertProfile:
-    """The insert's upper surface as a height over x and z.
-
-    Args:
-        insert: surface of the insert, in the insert frame.
-    """
+    """The insert's upper surface as a height over x and z, insert frame."""
 
     def __init__(self, insert: Surface) -> None:
         self._insert = insert
         self._above = float(insert.bounds[1, 1]) + 1e-3
 
     def at(self, points: Array) -> tuple[Array, Array]:
-        """Return the height y (n,), m, and the sagittal slope (n,), rad; NaN beside the insert.
+        """Return the height y (n,), m, and the sagittal slope (n,), rad, at points (n, 3).
 
-        Args:
-            points: positions in the insert frame, shape (n, 3), m; y is ignored.
+        NaN beside the insert.
         """
         start = np.array(points, float)
         start[:, 1] = self._above
@@ -89,11 +83,8 @@ def condyle_slip(
 ) -> tuple[CondyleSlip, CondyleSlip | None]:
     """Return rolling and slipping of the medial and the lateral condyle.
 
-    Args:
-        femoral: surface of the femoral component, femoral frame.
-        insert: surface of the insert, insert frame.
-        split: z between the condyles in the femoral frame, m; None: only a medial condyle.
-        coordinates: recorded knee coordinates, shape (f, 6), m and rad.
+    `femoral`, `split` (z, m) and `insert` are in their own frames; a `split` of None: only a medial
+    condyle. `coordinates` (f, 6) are recorded knee coordinates, m and rad.
     """
     lowest = LowestPoints(femoral, split)
     poses, profile = knee_pose(coordinates), InsertProfile(insert)
@@ -116,9 +107,8 @@ def slip_of_points(
     Args:
         points: lowest points of the condyle, insert frame, shape (f, 3), m.
         poses: pose_femoral_in_insert, shape (f, 4, 4).
-        axial_rotation: axial rotation, positive if the femur rotates externally, shape (f,), rad.
+        axial_rotation: positive if the femur rotates externally, shape (f,), rad.
         centre_z: z of the component's geometric centre, insert frame, shape (f,), m.
-        profile: height profile of the insert.
     """
     height, slope = profile.at(points)
     on_insert = np.column_stack([points[:, 0], height])
@@ -137,12 +127,8 @@ def slip_of_points(
 def femoral_arcs(points: Array, poses: Array) -> Array:
     """Return the arcs (f-1,), m, between successive lowest points, on the femoral surface.
 
-    At a lowest point the normal of the surface is the insert's -y. The tangent of the profile
-    therefore turns by the rotation of the femur about its ML axis.
-
-    Args:
-        points: lowest points, insert frame, shape (f, 3), m.
-        poses: pose_femoral_in_insert, shape (f, 4, 4).
+    At a lowest point the normal of the surface is the insert's -y, so that the tangent turns by the
+    rotation of the femur about its ML axis. Arguments as in `slip_of_points`.
     """
     back = inverse(poses)
     in_femur = transform(back, points[:, None])[:, 0]
@@ -167,15 +153,9 @@ def arc(chord: Array, turn: Array) -> Array:
 def sliding_velocity(velocity: Array, spin: Array, arm: Array, lever: Array) -> Array:
     """Return the forward sliding (f,), m/s, of the femur's contact point, without axial rotation.
 
-    By rigid-body kinematics it is (v + w x r)_x - w_y (z_condyle - z_centre).
-
-    Args:
-        velocity: velocity of the femoral origin relative to the insert, insert frame, shape (f, 3),
-            m/s.
-        spin: angular velocity of the femur relative to the insert, insert frame, shape (f, 3),
-            rad/s.
-        arm: vector from the femoral origin to the contact point, shape (f, 3), m.
-        lever: z of the contact point relative to the component's geometric centre, shape (f,), m.
+    By rigid-body kinematics it is (v + w x r)_x - w_y (z_condyle - z_centre), with v of the femoral
+    origin and w relative to the insert, r (`arm`) from this origin to the contact point, (f, 3) in
+    the insert frame, and `lever` (f,), m, the last difference.
     """
     return np.asarray((velocity + np.cross(spin, arm))[:, 0] - spin[:, 1] * lever)
 
@@ -183,11 +163,8 @@ def sliding_velocity(velocity: Array, spin: Array, arm: Array, lever: Array) -> 
 def forward_sliding(coordinates: Array, rates: Array, centre: Array, contact: Array) -> float:
     """Return the forward sliding (m/s) at a contact point by rigid-body kinematics.
 
-    Args:
-        coordinates: knee coordinates, shape (6,), m and rad.
-        rates: rates of the knee coordinates, shape (6,), m/s and rad/s.
-        centre: geometric centre of the component, femoral frame, shape (3,), m.
-        contact: contact point, insert frame, shape (3,), m.
+    Knee coordinates (6,) and their rates; the component's geometric centre is in the femoral frame,
+    the contact point in the insert frame, (3,), m.
     """
     velocity, spin = knee_twist(coordinates, rates)
     arm, lever = (
@@ -207,11 +184,9 @@ def roll_slip_motion(
     """Return the motion of Sharma (2008): AP follows from rolling and slip, SI from first touch.
 
     The mean of the condyles' contact points moves backwards along the insert by the femoral arc
-    less the slip. In every frame the femur is lowered to first touch.
+    less the slip; in every frame the femur is lowered to first touch.
 
     Args:
-        femoral: surface of the femoral component, femoral frame.
-        insert: surface of the insert, insert frame.
         split: z between the condyles in the femoral frame, m; None: one condyle.
         coordinates: knee coordinates, shape (f, 6), m and rad. Their rotations, ML, and the AP of
             the first frame are used.
@@ -241,8 +216,7 @@ def roll_slip_motion(
 def _mean_condyle(lowest: LowestPoints, poses: Array) -> tuple[Array, Array]:
     """Return arms (f, 3), m, and femoral arcs (f-1,), m, as means over the condyles.
 
-    An arm is the vector from the femoral origin to the lowest point. Arms and arcs depend on the
-    rotations alone.
+    An arm goes from the femoral origin to the lowest point. Both depend on the rotations alone.
     """
     condyle_points = [[point for point in lowest.at(pose) if point is not None] for pose in poses]
     points = np.array(condyle_points).swapaxes(0, 1)

@@ -5,10 +5,9 @@ fixed area A0,
 
     P = (sum_i A_i p_i^n / A0)^(1/n),    dP = sum_i (A_i/A0) (p_i/P)^(n-1) dp_i,
 
-of the pressures p_i at the map points with the areas A_i tends to the peak as n grows. Columns that
-come into contact do not disturb it, because p^n is smooth there. The foundations and the lattices
-whose contact forces lie along the femoral normal have exact derivatives dp_i. Of other models
-central differences are taken.
+of the pressures p_i at the map points with the areas A_i tends to the peak as n grows, and is
+smooth where columns come into contact. The foundations and the lattices whose contact forces lie
+along the femoral normal have exact derivatives dp_i, other models central differences.
 """
 
 from dataclasses import replace
@@ -34,11 +33,7 @@ def smooth_peaks(
 ) -> Array:
     """Return the smooth peak pressures (2,), Pa, of medial and lateral condyle.
 
-    Args:
-        contact: the contact model.
-        probe: a probe of the model.
-        probed: contact of the probe at the pose.
-        femur_pose: pose of the femoral component, shape (4, 4).
+    `probed` is the contact of the probe at the pose (4, 4) of the femoral component.
 
     Raises:
         ComputationError: the contact model is out of its range.

@@ -4,10 +4,10 @@ A solution x of r(x, p) = 0 depends on a parameter p by
 
     dx/dp = -(dr/dx)^-1 dr/dp.
 
-For a press, x is the height y of the femur, and r the difference of load and reaction. For an
-equilibrium, x are the released coordinates, and r the forces on them. All derivatives are those at
-the converged state: the contact is not solved again, its exact tangent gives its change. Patella
-and lines of the extensor mechanism are solved again at displaced poses, each from its neighbour.
+For a press, x is the height y of the femur, and r the difference of load and reaction; for an
+equilibrium, x are the released coordinates, and r the forces on them. The contact is not solved
+again: its exact tangent at the converged state gives its change. Patella and lines of the extensor
+mechanism are solved again at displaced poses, each from its neighbour.
 """
 
 from dataclasses import dataclass, replace
@@ -49,11 +49,7 @@ class PressDerivatives:
 
 
 def exact_tangent(contact: "ProbedContact", name: str) -> None:
-    """Raise an error unless a contact has the exact tangent.
-
-    Raises:
-        InputError: it has not; the message names the model.
-    """
+    """Raise an InputError, which names the model, unless a contact has the exact tangent."""
     if not (contact.known and contact.tangent and contact.exact):
         raise InputError(
             f"contact model '{name}' has no exact tangent",
@@ -67,9 +63,7 @@ def press_derivatives(
 ) -> PressDerivatives:
     """Return the derivatives of a press.
 
-    Args:
-        pose: pose of the femoral component after the press, shape (4, 4).
-        contact: the contact at this pose, with its exact tangent.
+    `pose` (4, 4) and `contact`, with its exact tangent, are those after the press.
     """
     slopes = condyle_slopes(contact)
     # The reaction is the force on the insert along -y.
@@ -146,10 +140,7 @@ class EquilibriumDerivatives:
 class ImplicitEquilibrium:
     """The equations of an equilibrium near its solution, with a linear contact.
 
-    Args:
-        search: the search that found the solution.
-        knee: the solution.
-        points: side -> point where an unloaded condyle is nearest to the insert.
+    `points` are, by side, those where an unloaded condyle is nearest to the insert.
     """
 
     def __init__(

@@ -48,12 +48,7 @@ AP = KNEE_COORDINATES.index("ap")
 
 
 class InitialPoses:
-    """The initial guesses of a search, the most likely guess first.
-
-    Args:
-        knee: object that searches from an initial guess.
-        post: cam and post; None: not modelled.
-    """
+    """The initial guesses of a search by `knee`, the most likely guess first."""
 
     def __init__(self, knee: ReleasedKnee, pair: ContactPair, post: "CamPost | None") -> None:
         self._knee, self._pair, self._post = knee, pair, post
@@ -63,13 +58,10 @@ class InitialPoses:
     ) -> KneeEquilibrium:
         """Return the equilibrium from the first initial guess from which the search succeeds.
 
-        If the equilibrium is farther than `INITIAL_POSE.max_continuation` from that guess, the
-        search is repeated from other guesses. If such a search ends at another equilibrium,
-        `second` of the result describes it.
-
-        Args:
-            previous: results of up to three previous frames, in their order.
-            points: side -> point (3,), m, where an unloaded condyle is nearest to the insert.
+        If it is farther than `INITIAL_POSE.max_continuation` from that guess, the search is
+        repeated from others; `second` of the result describes another equilibrium at which such a
+        search ends. `previous` are up to three previous frames in order; `points` (3,), m, are
+        those where an unloaded condyle is nearest to the insert.
 
         Raises:
             ComputationError: no initial guess lies over the insert, or no muscle forces balance the
@@ -133,7 +125,7 @@ class InitialPoses:
     def _guesses(self, recorded: Array, previous: list[Array]) -> Iterator[Array]:
         """Yield up to three initial guesses: extrapolated, of the last frame, and recorded.
 
-        The extrapolated guess keeps its height. The other two are at first touch.
+        The extrapolated guess keeps its height; the others are at first touch.
         """
         rows = list(self._knee.released)
         for number, released_guess in enumerate(
@@ -172,9 +164,8 @@ def _distance(first: Array, second: Array) -> float:
 def extrapolated(previous: list[Array]) -> Array:
     """Return coordinates (6,) extrapolated from up to three frames.
 
-    The last step is repeated with a factor from 0 to 1, the projection of the last step on the
-    previous step. `INITIAL_POSE.max_extrapolation` limits the extrapolation, because a lightly
-    loaded knee moves irregularly.
+    The last step is repeated with a factor from 0 to 1, its projection on the previous step. A
+    lightly loaded knee moves irregularly, hence the limit `INITIAL_POSE.max_extrapolation`.
     """
     if len(previous) < 3:
         return previous[-1]

@@ -1,10 +1,9 @@
 """Taut strings over wrap objects, and their forces on points and bodies by virtual work.
 
-The strings around a single object are computed in its frame, many strings at once. A string touches
-an object if the straight line would pass through it. If the half of a cylinder is prescribed, a
-string also touches if the straight line passes on the wrong side. A string with an end inside the
-object ignores the object, as in OpenSim (ellipsoids: see below). Each string is the shortest, so
-that dL/dq follows from its directions at the ends alone.
+Strings around one object are computed in its frame, many at once. A string touches it if the
+straight line would pass through it or, with a prescribed half of a cylinder, on the wrong side. A
+string with an end inside the object ignores it, as in OpenSim (ellipsoids: see below). Each string
+is the shortest, so that dL/dq follows from its directions at the ends alone.
 
 Let r be the radius of a circle, d₁ and d₂ the distances of the string's ends from its centre, and Δ
 the angle between the ends. The arc θ and the length S are
@@ -13,21 +12,20 @@ the angle between the ends. The arc θ and the length S are
 
 A cylinder is unrolled: L = √(S² + Δz²), with z linear in S.
 
-A path point P of another body may move into an ellipsoid. In OpenSim the string then ignores the
-ellipsoid at once, and its length jumps by up to 14 mm. In tkamb the ellipsoid shrinks with the
-point by the factor k = |P/a|, so that the length is continuous. L is homogeneous of degree one in
-P, Q and k, so that
+A path point P of another body may move into an ellipsoid. In OpenSim the string then ignores it at
+once, and its length jumps by up to 14 mm. In tkamb the ellipsoid shrinks with the point by the
+factor k = |P/a|, so that the length is continuous. L is homogeneous of degree one in P, Q and k, so
+that
 
     ∂L/∂k = (L + P·u_P - Q·u_Q) / k,
 
 where u_P and u_Q are the string's directions at P and Q. The force on the point is -∂L/∂k ∂k/∂P.
 
-For several objects, the iteration updates the touching points on one object after the other. It has
-converged when no touching point moves. Then every straight part is tangent to the objects at its
-ends, so that the string is taut.
+For several objects, the touching points on one object after the other are updated until none moves.
+Then every straight part is tangent to the objects at its ends: the string is taut.
 
-A string of unit tension exerts a force on each path point, and on each wrap object at the points
-where the string meets and leaves it. The forces of a string on all bodies balance.
+A string of unit tension exerts forces on each path point, and on each wrap object where it meets
+and leaves it. They balance.
 """
 
 from collections.abc import Sequence
@@ -69,12 +67,8 @@ class WrapTouch:
 def touch(wrap: WrapObject, start: Array, end: Array, moves: Mask) -> WrapTouch:
     """Return the touching points of strings on a wrap object.
 
-    Args:
-        wrap: the object.
-        start: starts of the strings in the object's frame, m, shape (f, 3).
-        end: ends of the strings in the object's frame, m, shape (f, 3).
-        moves: whether start and end are path points of another body than the object's, shape
-            (f, 2).
+    `start` and `end` (f, 3), m, are in the object's frame; `moves` (f, 2) marks path points of
+    another body than the object's.
     """
     if wrap.shape == "cylinder":
         return _cylinder(start, end, wrap.dimensions[0], wrap.dimensions[1], wrap.quadrant)
@@ -107,11 +101,8 @@ def _around(
 ) -> tuple[Array, Array, tuple[Array, Array]]:
     """Return a taut string around a circle.
 
-    Args:
-        distances: distances of start and end from the centre, m, each of shape (f,).
-        sweep: signed angle about the centre from start to end, on the string's side, rad, shape
-            (f,).
-        radius: radius of the circle, m.
+    `distances` (f,), m, of start and end are from the centre; `sweep` (f,), rad, is the signed
+    angle about it from start to end, on the string's side.
 
     Returns:
         Signed angle of the arc (f,), rad, zero if the string does not touch; angle (f,) from the
@@ -198,7 +189,7 @@ def _section(start: Array, end: Array, outline: Array) -> WrapTouch:
 
 
 def inside(wrap: WrapObject, points: Array) -> Mask:
-    """Return whether points (f, 3), m, in the object's frame lie where strings ignore the object.
+    """Return whether strings ignore the object because of points (f, 3), m, inside, in its frame.
 
     No string ignores an ellipsoid, because it shrinks, or a torus.
     """
@@ -217,8 +208,8 @@ def inside(wrap: WrapObject, points: Array) -> Mask:
 def _torus(start: Array, end: Array, ring: float, tube: float) -> WrapTouch:
     """Return strings through a torus about z, in contact with the inside of its ring.
 
-    The ring is replaced by a cylinder along its tangent, at the angle at which the string is
-    longest. The length is stationary there, so that dL/dq does not depend on the angle's change.
+    A cylinder along the ring's tangent replaces it, at the angle at which the string is longest:
+    there dL/dq does not depend on the angle's change.
     """
     rows = np.arange(len(start))
 
@@ -296,10 +287,9 @@ class WrappedStrings:
     """f strings over w objects.
 
     Args:
-        order: indices of the objects that a string touches, from start to end, then -1, shape
-            (f, w).
-        entry: points where the strings meet the objects, m, shape (f, w, 3).
-        exit: points where the strings leave the objects, m, shape (f, w, 3).
+        order: indices of the objects that a string touches, from start to end, then -1, shape (f,
+            w).
+        entry: points where the strings meet the objects, m, shape (f, w, 3); `exit`: leave.
         arc_m: lengths on the objects, m, shape (f, w); NaN if the iteration has not converged.
         push: force of a shrinking object on start and end, per unit tension, shape (f, w, 2, 3).
     """
@@ -323,9 +313,7 @@ def strings_over(
 
     Args:
         wraps: w objects, in the order in which they are tried.
-        poses: poses of the objects in the frame of the points, shape (f, w, 4, 4).
-        start: first points, m, shape (f, 3).
-        end: last points, m, shape (f, 3).
+        poses: of the objects in the frame of the points, shape (f, w, 4, 4).
         allowed: whether a string may touch an object, shape (f, w).
         moves: whether start and end belong to another body than object w, shape (f, w, 2).
     """
@@ -355,8 +343,7 @@ def strings_over(
 def _leap(value: Array, last_value: Array, residual: Array, last_residual: Array) -> Array:
     """Return the extrapolation (f, 6w), m, from the last two sweeps (Aitken, Anderson).
 
-    The extrapolation is zero until two sweeps touch the same objects, or if it would exceed
-    `max_extrapolation`.
+    It is zero until two sweeps touch the same objects, or beyond `max_extrapolation`.
     """
     change = residual - last_residual
     squared = np.maximum((change**2).sum(axis=1), 1e-300)
@@ -471,11 +458,8 @@ class StraightParts:
 class Tension:
     """Forces of strings of unit tension on path points and bodies, summed part by part.
 
-    Args:
-        points: path points in ground, m, shape (f, k, 3).
-        lines: index of each point's muscle or ligament, shape (k,).
-        bodies: index of each point's body, shape (k,).
-        count: number of muscles and ligaments, and number of bodies.
+    `points` (f, k, 3), m, are in ground; `lines` and `bodies` (k,) are each point's muscle or
+    ligament and body; `count` the numbers of both.
     """
 
     def __init__(self, points: Array, lines: Index, bodies: Index, count: tuple[int, int]) -> None:
@@ -497,10 +481,7 @@ class Tension:
     def pull_wrapped(
         self, rows: Index, k: int, next_point: Index, strings: WrappedStrings, bodies: Index
     ) -> None:
-        """Add strings from path point k to points `next_point` in frames `rows`, over wrap objects.
-
-        `bodies` are the indices of the wrap objects' bodies.
-        """
+        """Add strings in frames `rows` from path point k to `next_point`, over wrap objects."""
         owner, at = int(self.lines[k]), np.arange(len(rows))
         place, last = self.points[rows, k], np.full(len(rows), -1)
         for gap in range(len(bodies) + 1):
@@ -557,10 +538,7 @@ class Tension:
 
 
 def _direction(start: Array, end: Array) -> tuple[Array, Array]:
-    """Return unit vectors (f, 3) from start to end, and distances (f,).
-
-    The vector is zero if start and end coincide.
-    """
+    """Return unit vectors (f, 3) from start to end, zero if both coincide, and distances (f,)."""
     step = end - start
     distance = np.linalg.norm(step, axis=-1)
     return step / np.maximum(distance, 1e-300)[:, None], distance

@@ -3,15 +3,15 @@
     sum_k J_k(q)^T w_k x_k = RNEA(q, v, a) - sum_known J^T w_known
 
 Each unknown x_k is the magnitude of a load w_k with a known line of action or axis (the reduction
-method). There are as many unknowns as equations of motion. All points and directions are in the
-insert frame, SI units. The two loads of a pair are equal and opposite: only hip and ground exert
-external loads on the leg.
+method), as many as equations of motion. All points and directions are in the insert frame, SI
+units. The two loads of a pair are equal and opposite: only hip and ground exert external loads on
+the leg.
 
-Lines pull and contacts push: the two normal forces, the muscle's tension, the patellar ligament's
-tension and the patellofemoral normal force are >= 0. A load that would have the wrong sign is zero,
-and a residual moment replaces it as unknown. There are at most six load states: both condyles
-loaded, the medial one lifted, or the lateral one lifted, each with the extensor mechanism taut or
-slack. The recorded gap may exclude some of these states.
+Lines pull and contacts push: the two normal forces, the tensions of muscle and patellar ligament
+and the patellofemoral normal force are >= 0. A load that would have the wrong sign is zero, and a
+residual moment replaces it as unknown. There are at most six load states: both condyles loaded, the
+medial or the lateral one lifted, each with the extensor mechanism taut or slack. The recorded gap
+may exclude some.
 
 Reference: Komistek et al., J Biomech 38:215 (2005), doi:10.1016/j.jbiomech.2004.02.041.
 """
@@ -74,8 +74,8 @@ class CondylePoint:
     def direction(self, friction: float) -> Array:
         """Return the contact force on the femur (3,) per unit normal force.
 
-        The result is n - mu t with t = v / sqrt(|v|² + v0²) for the tangential velocity v: Coulomb
-        friction that fades below v0 = 1 mm/s.
+        It is n - mu t with t = v / sqrt(|v|² + v0²) for the tangential velocity v: Coulomb friction
+        that fades below v0 = 1 mm/s.
         """
         tangential = self.sliding - (self.sliding @ self.normal) * self.normal
         # Without v0 the direction of the force would jump when the sliding reverses.
@@ -114,10 +114,8 @@ class Solution:
 def solve(names: Sequence[str], columns: Array, right: Array) -> Solution:
     """Solve the equations of motion of one frame for the magnitudes of the unknown loads.
 
-    Args:
-        names: names of the k unknowns.
-        columns: generalised force per unit of each unknown, shape (k, k).
-        right: generalised forces that the unknown loads must add up to, shape (k,).
+    `columns` (k, k) are generalised forces per unit of each unknown; they must add up to `right`
+    (k,).
 
     Raises:
         ValueError: the system is not square.
@@ -178,9 +176,7 @@ def hip(point: Array) -> list[Unknown]:
 def intersegmental(point: Array, rotation_axes: dict[str, Array]) -> list[Unknown]:
     """Return the knee's force and moment on the femur, for a knee without contact.
 
-    Args:
-        point: knee centre, shape (3,), m.
-        rotation_axes: name -> unit axis (3,) of a moment.
+    `point` (3,), m, is the knee centre; `rotation_axes` (3,) are unit axes of moments by name.
     """
     forces = [
         Unknown(f"knee_force_{name}", pair("femur", "tibia", point, axis))
@@ -196,10 +192,7 @@ def intersegmental(point: Array, rotation_axes: dict[str, Array]) -> list[Unknow
 def patellofemoral(point: Array, normal: Array, femur_ml: Array) -> list[Unknown]:
     """Return the patellofemoral force in the femur's sagittal plane.
 
-    Args:
-        point: contact point, shape (3,), m.
-        normal: unit normal from femur to patella, in the sagittal plane, shape (3,).
-        femur_ml: unit medial-lateral axis of the femur, shape (3,).
+    `normal` (3,) is from femur to patella in that plane, `femur_ml` (3,) the femur's unit ML axis.
     """
     # The tangential force along the groove is zero for a massless patella in equilibrium.
     tangent = cross(femur_ml, normal)
@@ -212,11 +205,8 @@ def patellofemoral(point: Array, normal: Array, femur_ml: Array) -> list[Unknown
 def unloaded_patella(point: Array, femur_ml: Array) -> list[Unknown]:
     """Return the loads that balance the patella's weight if no other loads do.
 
-    These are the loads of a slack extensor mechanism and of a released, massless patella.
-
-    Args:
-        point: contact point on the femur, shape (3,), m.
-        femur_ml: unit medial-lateral axis of the femur, shape (3,).
+    They replace a slack extensor mechanism, or belong to a released, massless patella. `point`
+    (3,), m, is the contact point on the femur.
     """
     # Any two directions in the sagittal plane can be used.
     first = cross(femur_ml, AXES["ap"])
@@ -239,8 +229,8 @@ def residuals(point: Array, lifted: bool, extensor: bool) -> list[Unknown]:
 
     Args:
         point: midpoint of the contact points, where the residual forces act, shape (3,), m.
-        lifted: whether a condyle is lifted off; a coronal moment then replaces its force.
-        extensor: whether the extensor group acts; if not, a flexion moment is another residual.
+        lifted: a coronal moment replaces the force of a lifted condyle.
+        extensor: if the extensor group does not act, a flexion moment is another residual.
     """
     unknowns = [
         Unknown("residual_ap", pair("tibia", "femur", point, AXES["ap"])),
@@ -289,12 +279,8 @@ def load_states(
     """Return the load states to try, the preferred states first.
 
     States with fewer zero loads come first. A slack muscle comes before a lifted condyle, because
-    the recorded gap shows contact, but no recording shows the activity of the muscle.
-
-    Args:
-        sides: names of the modelled condyles.
-        lifted_by_gap: sides that are lifted off the insert by their recorded gap.
-        extensors: names of the extensor muscles; empty: they are not modelled.
+    the recorded gap shows contact, but no recording shows the activity of the muscle. `sides` are
+    the modelled condyles, `extensors` muscles; `lifted_by_gap`: by the recorded gap.
     """
     not_lifted = [side for side in sides if side not in lifted_by_gap]
     lifted = [
@@ -336,12 +322,8 @@ def contradictions(
 ) -> list[str]:
     """Return reasons why a load state is inadmissible; empty: it is admissible.
 
-    The reason is a load of the wrong sign, or a zero load that would act with the right sign.
-
-    Args:
-        state: the load state.
-        solutions: load state -> its solution, for all states.
-        lifted_by_gap: sides that are lifted off the insert by their recorded gap.
+    It is a load of the wrong sign, or a zero load that would act with the right sign. `solutions`
+    has those of all states.
     """
     wrong = wrong_signs(state, solutions[state])
     if state.slack:

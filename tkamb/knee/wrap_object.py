@@ -1,8 +1,8 @@
 """Surfaces that a string wraps: simple solids, and the convex section of a mesh.
 
-The section of a mesh is a general cylinder: a convex outline in the object's x-y plane, extruded
-along its z axis. With x to the right and y up the string runs clockwise, in front of the outline
-(+x), from its first point to its last (`tkamb.knee.wrapping`).
+The section of a mesh is a convex outline in the object's x-y plane, extruded along its z axis. With
+x to the right and y up the string runs clockwise, in front of the outline (+x), from its first
+point to its last (`tkamb.knee.wrapping`).
 """
 
 from dataclasses import dataclass, replace

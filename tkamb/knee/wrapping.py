@@ -1,17 +1,16 @@
 """The taut path of a massless string around a bone's convex sagittal outline.
 
-The bone is a general cylinder: a convex polygon in its x-y plane, extruded along z. The string
-passes in front of the bone (+x): with x to the right and y up it runs clockwise from start to end.
-The unrolled cylinder gives the shortest length. If S is the length of the taut path in the x-y
-plane,
+The bone is a convex polygon in its x-y plane, extruded along z. The string passes in front of it
+(+x): with x to the right and y up it runs clockwise from start to end. Unrolling gives the shortest
+length. If S is that of the taut path in the x-y plane,
 
     L = sqrt(S² + dz²),   z linear in S.
 
-When the tangent corner changes or wrapping begins, the two candidate paths coincide. Length and
-moment arm are therefore continuous.
+When the tangent corner changes or wrapping begins, the two candidate paths coincide, so that length
+and moment arm are continuous.
 
-There is no friction: the tension is constant along the string. The force of the string on the bone
-at a corner is the tension times the change of direction. This force has no z component.
+Without friction the tension is constant along the string. Its force on the bone at a corner is the
+tension times the change of direction, without z component.
 """
 
 from dataclasses import dataclass
@@ -74,13 +73,9 @@ def straight_path(start: Array, end: Array) -> TautPath:
 def taut_path(start: Array, end: Array, outline: Array) -> TautPath:
     """Return the taut path around an outline in the bone's frame.
 
-    The clockwise angle from start to end about the outline's centre (x to the right, y up) decides
-    on which side the string passes. The angle is between -90 and 270 deg.
-
-    Args:
-        start: start of the path, bone frame, shape (3,), m.
-        end: end of the path, bone frame, shape (3,), m.
-        outline: strictly convex polygon in x-y, counter-clockwise, shape (n, 2), m.
+    The clockwise angle from start to end about the outline's centre, between -90 and 270 deg,
+    decides on which side the string passes. All are in the bone's frame; `outline` (n, 2), m, is a
+    strictly convex polygon in x-y, counter-clockwise.
 
     Raises:
         ComputationError: start or end lies inside the outline.
@@ -103,11 +98,8 @@ def path_in_link(
 ) -> TautPath:
     """Return the taut path between two points around an outline that is fixed to a link.
 
-    Args:
-        start: start of the path, in the result's frame, shape (3,), m.
-        end: end of the path, in the result's frame, shape (3,), m.
-        outline: outline in the link's sagittal plane, shape (n, 2), m; None: a straight path.
-        pose_link_in_here: pose of the link in the result's frame, shape (4, 4).
+    `start` and `end` (3,), m, are in the result's frame; `outline` (n, 2), m, is in the link's
+    sagittal plane; None: a straight path.
     """
     if outline is None:
         return straight_path(np.asarray(start, float), np.asarray(end, float))
@@ -136,7 +128,6 @@ def _is_inside(point: Array, outline: Array) -> bool:
 
 @compiled_as_written
 def _sweep(start: Array, end: Array, outline: Array) -> float:
-    """Return the clockwise angle (rad) from start to end about the outline's centre."""
     # The centroid of a convex outline lies inside the outline: the angle about it is defined.
     x, y = np.mean(outline[:, 0]), np.mean(outline[:, 1])
     ax, ay, bx, by = start[0] - x, start[1] - y, end[0] - x, end[1] - y
@@ -162,13 +153,8 @@ def _crosses(start: Array, end: Array, outline: Array) -> bool:
 def _taut(start: Array, end: Array, outline: Array) -> tuple[Array, float, float, int]:
     """Return the taut path's points (m, 3), length and turn, and the end inside the outline.
 
-    The path is straight if the segment misses the outline. Otherwise it touches the outline from
-    the corner of the tangent through the start to the corner of the tangent through the end.
-
-    Args:
-        start: start of the path, shape (3,), m.
-        end: end of the path, shape (3,), m.
-        outline: convex polygon, shape (n, 2), m.
+    It is straight if the segment misses the outline; otherwise it touches it from the corner of the
+    tangent through the start to that of the tangent through the end.
     """
     ends, straight = np.stack((start, end)), np.sqrt(np.sum((end - start) ** 2))
     if _is_inside(start, outline):
