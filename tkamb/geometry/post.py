@@ -128,6 +128,7 @@ def divide_insert(insert: Surface) -> tuple[Surface, Surface]:
     A horizontal plane just above the surroundings separates them. In front the post is cut at a
     plane x = const, the fixed bottom of the cam-post contact; the material in front of it is
     removed.
+
     Raises:
         InputError: there is no post, or it cannot be divided.
     """
@@ -199,6 +200,7 @@ def closed_by_fans(vertices: Array, faces: Index, name: str) -> tuple[Array, Ind
     """Return vertices and faces of the surface; a fan of triangles closes every hole.
 
     The holes are plane; `name` of the part is for a message.
+
     Raises:
         InputError: a fan about a hole's centre would overlap itself.
     """
