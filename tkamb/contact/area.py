@@ -35,12 +35,8 @@ def covered_areas(
     contact.
 
     Args:
-        points: (n, 3) m, nodes.
-        triangles: (k, 3) nodes of each triangle.
-        triangle_area: (k,) m².
         pressure: (n,) Pa, nodal force divided by tributary area; positive in contact.
         gap: (n,) m, gap of the deformed body near the contact.
-        material: material of the elastic body.
 
     Reference:
         Johnson, Contact Mechanics, Cambridge 1985, sections 4.2 (line contact) and 5.1 (any smooth
@@ -108,10 +104,7 @@ def area_above(points: Array, triangles: Index, pressure: Array, level: float) -
     mean of q is exact. The area is continuous in the pressures.
 
     Args:
-        points: (n, 3) m, nodes.
-        triangles: (k, 3) nodes of each triangle.
-        pressure: (n,) Pa, at the nodes.
-        level: Pa, positive.
+        Points (n, 3), m, and pressure (n,), Pa, are those of the nodes; level: Pa, positive.
     """
     # p² is interpolated, because it is linear at the rim of a Hertzian contact while p has a
     # vertical slope there.

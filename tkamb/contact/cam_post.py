@@ -99,8 +99,6 @@ class PostContact:
     Args:
         load: wrench of the normal forces on the insert; None without contact.
         gap: m, along x between cam and post; negative if they overlap.
-        area: m², contact area.
-        peak_pressure: Pa.
         problem: reason why there is no result; empty if there is one.
     """
 

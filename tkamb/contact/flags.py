@@ -91,7 +91,6 @@ class ArticularEdge:
     Args:
         origin: (2,) m, x and z of the first cell.
         away: (a, b) m, distance of each cell's centre from the nearest cell beyond the edge.
-        spacing: m, edge of the cells.
     """
 
     origin: Array

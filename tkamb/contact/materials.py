@@ -197,10 +197,8 @@ class Material:
     """An isotropic material with a one-dimensional stress-strain law.
 
     Args:
-        name: name in messages.
         young_modulus: E, Pa, the slope at the origin.
         poisson_ratio: nu, -1 < nu < 0.5.
-        law: shape of the stress-strain curve.
         sources: origin of the numbers; not compared between materials.
 
     Raises:

@@ -34,7 +34,6 @@ class ContactPair:
     Args:
         femoral: rigid femoral component, in the femoral frame.
         insert: closed insert, in the insert frame; its flat bottom lies in y = 0 and faces -y.
-        material: the insert's material.
         bearing: "fixed" (the bottom is bonded) or "mobile" (the bottom slides in x and z).
     """
 

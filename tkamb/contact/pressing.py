@@ -63,9 +63,8 @@ class LoadSearch:
     """Result of the search for a load.
 
     Args:
-        approach: m, approach that carries the load; NaN if the load cannot be reached.
-        evaluations: number of computed reactions.
-        residual: smallest |reaction - load| / load of these evaluations.
+        approach: m, that carries the load; NaN if the load cannot be reached.
+        residual: smallest |reaction - load| / load of the evaluations.
         deepest: m, largest evaluated approach.
     """
 

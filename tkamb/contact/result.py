@@ -46,10 +46,8 @@ class CondyleContact:
 
     Args:
         force: N, magnitude of the summed normal forces on the insert.
-        area: m², area in contact.
         mean_pressure: Pa, force / area. Sharma (2008) divides the sum of the nodal forces'
             magnitudes by the area, which is larger on a curved surface.
-        peak_pressure: Pa.
         centre_of_pressure: (3,) m, insert frame.
         thickness: m, insert under the centre of pressure, along y.
     """
@@ -75,7 +73,6 @@ class ContactResult:
     frame, SI.
 
     Args:
-        pair: the two bodies.
         pose: (4, 4) pose_femoral_in_insert of this contact; after a press the pressed pose.
         points: (n, 3) m, map points on the undeformed insert.
         normals: (n, 3) outward unit normals of the insert at these points.
@@ -86,12 +83,6 @@ class ContactResult:
         places: (n, 3) m, where the nodal forces act: the map points, or the points of the femoral
             component that the columns of a foundation meet.
         wrench_on_insert: (6,) force (N) and moment about the insert origin (N·m).
-        medial: contact of the medial (or only) condyle; None if it is unloaded.
-        lateral: contact of the lateral condyle; None if it is unloaded or does not exist.
-        status: how the evaluation ended.
-        iterations: number of iterations of the model's solver.
-        residual: relative residual of that solver.
-        flags: warnings in words.
     """
 
     pair: ContactPair

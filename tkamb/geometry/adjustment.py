@@ -72,8 +72,7 @@ class Adjustment:
     """The adjustment of a recorded pose before contact.
 
     Args:
-        pose: (4, 4) adjusted pose_femoral_in_insert.
-        recorded: (4, 4) recorded pose_femoral_in_insert.
+        pose: (4, 4) adjusted pose_femoral_in_insert; `recorded` before the adjustment.
         translation: m, move of the component's centre along y; negative is downwards.
         coronal_angle: rad, turn of the femur about the insert's x axis.
         measured_angle: rad, coronal angle of the recorded pose.
@@ -83,7 +82,6 @@ class Adjustment:
         final_angle: rad, difference of the penetrations / intercondylar distance.
         restored: whether the recorded rotation was restored after the press. `pose` is then the
             restored pose, and `coronal_angle` the turn that was undone.
-        flags: warnings in words that the result depends on a limit.
     """
 
     pose: Array

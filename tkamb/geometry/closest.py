@@ -161,8 +161,6 @@ class ClosestPointQuery:
     The normal is the mean over the close region, because it turns smoothly as the contact moves.
 
     Args:
-        femoral: femoral component, femoral frame.
-        insert: insert, insert frame.
         split: z (m, femoral frame) between the condyles; None for one condyle.
     """
 

@@ -79,10 +79,7 @@ class YawSearch:
     """Settings of the search for the line through both condyles in the horizontal plane.
 
     Args:
-        step: rad, angle between two directions of the search.
-        spacing: m, spacing of the samples of the surface.
-        strip: m, width of the strips along a direction.
-        flexions: rad, flexions over which the outline is averaged.
+        flexions: rad, over which the outline is averaged; `step`: rad; `spacing`, `strip`: m.
         largest_yaw: rad, largest accepted angle between the line and z. On real components the
             error of the estimate is at most 3 deg; at 20 deg the plane between the condyles cuts
             them.

@@ -122,10 +122,7 @@ def crossed_patch(
     direction). A ray that passes its patch keeps its distance.
 
     Args:
-        quadratics: `CurvedSurface.quadratics`.
-        patch: number of the patch.
-        origin: (3,) m, start of the ray.
-        direction: (3,) unit vector.
+        origin: (3,) m, start of the ray along the unit vector `direction`.
         distance: m, to the triangle.
         gradient: (3,) output, q, outward, of a length of about 1.
     """

@@ -63,7 +63,6 @@ class Defect:
     """A defect of a surface.
 
     Args:
-        kind: kind of defect.
         words: the defect in words, like "an opening 6 mm wide".
         places: (m, 3) m, points of the defect, frame of the surface.
     """

@@ -48,9 +48,7 @@ class FlatBottom:
     """Triangles of a surface that lie in one plane.
 
     Args:
-        normal: (3,) unit outward normal, in the surface's frame.
-        centre: (3,) m, centre of area.
-        area: m².
+        normal: (3,) unit outward normal, in the surface's frame like the centre of area (3,), m.
         faces: (k,) indices of the flat's triangles.
         vertices: (n,) indices of the surface's vertices in the plane.
         noise: m, root mean square distance of these vertices from the plane.

@@ -40,9 +40,8 @@ class Intervals:
 
     Args:
         first: (m,) index of the interval's line along the axis after `axis` (cyclic: x, y, z, x).
-        second: (m,) index of the line along the axis before `axis`.
-        lower: (m,) m, coordinate along `axis` at which the line enters the surface.
-        upper: (m,) m, coordinate along `axis` at which the line leaves it.
+        second: (m,) the same along the axis before it.
+        lower: (m,) m, coordinate along `axis` at which the line enters; it leaves at `upper`.
         mended: number of lines with an odd number of crossings, repaired from their neighbours.
     """
 
@@ -57,9 +56,8 @@ def inside_intervals(surface: Surface, axis: int, first: Array, second: Array) -
     """Return the intervals in which lines along `axis` run inside a closed surface.
 
     Args:
-        axis: 0, 1 or 2, the direction of the lines.
         first: (a,) increasing coordinates (m) of the lines along axis + 1 (cyclic).
-        second: (b,) increasing coordinates (m) of the lines along axis + 2 (cyclic).
+        second: (b,) the same along axis + 2.
 
     Raises:
         InputError: more than 1 % of the lines cross the surface an odd number of times, or such a

@@ -161,9 +161,9 @@ class Nearest:
     """The points of a surface that are nearest to n given points.
 
     Args:
-        distance: (n,) m, between each given point and its nearest point.
-        faces: (n,) triangle on which the nearest point lies.
-        weights: (n, 3) barycentric coordinates of the nearest point.
+        distance: (n,) m, from the given points.
+        faces: (n,) triangles of the nearest points.
+        weights: (n, 3) their barycentric coordinates.
     """
 
     distance: Array

@@ -60,13 +60,10 @@ class Post:
     """Position and size of a post, insert frame.
 
     Args:
-        x: m, x of the centre.
-        z: m, z of the centre.
+        x: m, of the centre, like `z`.
         height: m, height of the tip above the lowest dish.
-        area: m², area of the post in the plan view.
         foot: m, y of the plane at which the post is cut off.
         front: m, x of the anterior face, at three quarters of the height above the foot.
-        half_width: m, half the width along z.
     """
 
     x: float

@@ -143,8 +143,7 @@ class RayCaster:
         A crossing at an edge or a vertex appears once if its triangles face in the same direction.
 
         Args:
-            origins: (n, 3) m.
-            directions: (n, 3) or (3,), any length but zero.
+            Arguments as in `first`.
 
         Returns:
             ray (m,), distance (m,), m, and face (m,), sorted by ray, then by distance.

@@ -45,7 +45,6 @@ class Repair:
     """A repaired surface and the notices of its repairs.
 
     Args:
-        vertices: (n, 3) m.
         faces: (k, 3) vertices of the triangles, with consistent winding; outward if closed.
         notices: one phrase per kind of repair; empty without repairs.
         holes: loops that are open after the repair, widest first.
@@ -67,10 +66,6 @@ def repair(vertices: Array, faces: Index) -> Repair:
     Equal vertices are merged without a notice, because in an STL file every triangle has separate
     vertices. A triangle without area but with three different corners stays, because it closes the
     surface.
-
-    Args:
-        vertices: (n, 3) m, finite.
-        faces: (k, 3) vertices of the triangles.
     """
     unused = len(vertices) - int(_used(vertices, faces).sum())
     vertices, faces = _merged(vertices, faces)

@@ -287,7 +287,6 @@ class Surface:
 
         Args:
             vertices: (n, 3) m, moved, worn or more than those of this surface.
-            faces: (k, 3) vertices of the triangles.
             pose_here_in_there: pose or mirror image (4, 4) that moves the defects; None: identity.
         """
         merged = self.merged and len(vertices) == len(self.vertices)

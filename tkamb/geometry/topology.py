@@ -165,9 +165,7 @@ class Body:
     """A connected part of a surface, with the voids within it.
 
     Args:
-        faces: (m,) indices of the faces.
-        extents: (3,) size of the bounding box, units of the surface.
-        centre: (3,) centre of the bounding box, units of the surface.
+        extents: (3,) size of the bounding box, units of the surface, like its `centre`.
         area: area of the outer surface, square units of the surface.
         closed: True if the outer surface has no open edge.
     """

@@ -104,9 +104,8 @@ class AdjustmentEffect:
     """Difference of a frame with adjustment from the same frame without.
 
     Args:
-        force: change of the total contact force, N; NaN if one of the two frames has no solution.
+        force: N, of the total contact force; NaN if one of the two frames has no solution.
         share: change of the medial share of the normal force.
-        cause: words that describe the largest change of the contact.
     """
 
     force: float

@@ -35,17 +35,12 @@ class Anatomy:
     """The knee in a model.
 
     Args:
-        model: the user's model, unchanged.
-        tibia: frame of the tibia.
-        femur: frame of the femur.
         femoral: axes of the femoral component's mesh, fixed to the femur.
         insert: axes of the insert's mesh, fixed to the tibia.
-        hip: hip centre, fixed to the femur.
         patella: frame of a patella that moves against the femur; None: the model has none.
         plane: frame of the patella's sagittal plane, fixed to the femur.
         knee_joints: indices of the joints between tibia and femur, ascending.
         shank: indices of the joints whose bodies are on the tibia's side.
-        names: part -> name of its frame, as given by the user.
     """
 
     model: pin.Model

@@ -150,7 +150,7 @@ class KneePose:
     """The pose of a right knee, or of the mirror image of a left one, at one instant.
 
     Args:
-        pose: pose of the femoral component in the insert frame, shape (4, 4).
+        pose: pose of the femoral component in the insert frame, (4, 4).
         patella: coordinates (3,), m, m, rad; None: the model has no patella.
     """
 

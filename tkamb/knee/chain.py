@@ -29,10 +29,10 @@ class ChainMotion:
     """The motion of the chain at one instant, SI units.
 
     Args:
-        tibia: pose_tibia_in_laboratory, shape (4, 4) (x forward, y up, z right).
-        tibia_velocity: spatial velocity (linear, angular) in the tibia's frame, shape (6,).
-        tibia_acceleration: spatial acceleration in the tibia's frame, shape (6,).
-        joints: coordinates, rates and accelerations of knee (and patella), shape (3, 6) or (3, 9).
+        tibia: pose_tibia_in_laboratory, (4, 4) (x forward, y up, z right).
+        tibia_velocity: spatial velocity (linear, angular) in the tibia's frame, (6,).
+        tibia_acceleration: spatial acceleration in the tibia's frame, (6,).
+        joints: coordinates, rates and accelerations of knee (and patella), (3, 6) or (3, 9).
     """
 
     tibia: Array
@@ -72,7 +72,7 @@ class Chain:
 
         Args:
             mass_factor: factor on the mass and inertia of every segment.
-            insert_shift: displacement of insert and femur, insert axes, shape (3,), m.
+            insert_shift: displacement of insert and femur, insert axes, (3,), m.
             insert_turn: rotation of insert and femur about the insert's origin, insert axes, shape
                 (3, 3); None: no rotation.
         """
@@ -201,7 +201,7 @@ class ChainState:
     """The chain at one instant. Poses and loads are in the insert frame.
 
     Attributes:
-        inertial: RNEA(q, v, a), shape (nv,): generalised forces that all loads must add up to.
+        inertial: RNEA(q, v, a), (nv,): generalised forces that all loads must add up to.
     """
 
     def __init__(self, chain: Chain, q: Array, v: Array, a: Array) -> None:

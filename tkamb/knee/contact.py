@@ -158,7 +158,7 @@ class KneeContact:
 
         Args:
             probe: probe of the model; its state is the warm start.
-            twist: constant twist of the femur, shape (6,).
+            twist: constant twist of the femur, (6,).
             exact: True: central differences replace an approximate tangent of the model.
         """
         if exact:

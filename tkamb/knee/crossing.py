@@ -54,8 +54,8 @@ class CrossingLines:
     """Lines from the shank to the thigh at one frame.
 
     Args:
-        shank: points where the lines leave the shank or foot, tibia frame, shape (c, 3), m.
-        thigh: points where they arrive at the thigh or pelvis, femur frame, shape (c, 3), m.
+        shank: points where the lines leave the shank or foot, tibia frame, (c, 3), m.
+        thigh: points where they arrive at the thigh or pelvis, femur frame, (c, 3), m.
         knee: pose of the femur in the tibia for which they were computed, (4, 4); None: unknown.
     """
 
@@ -112,16 +112,12 @@ class MuscleShare:
     """The force of each muscle of a leg at one frame.
 
     Args:
-        muscles: names of the m muscles.
-        activation: activations, 0 to 1, shape (m,).
-        force: muscle forces, shape (m,), N.
-        coordinates: names of the n balanced coordinates of the leg.
-        moment: joint moments that muscles and reserves supply together, shape (n,), N·m.
-        reserve: moments that no muscle supplies, a part of `moment`, shape (n,), N·m.
+        activation: activations, 0 to 1, (m,).
+        force: muscle forces, (m,), N.
+        moment: joint moments that muscles and reserves supply together, (n,), N·m.
+        reserve: moments that no muscle supplies, a part of `moment`, (n,), N·m.
         flexion: index of the knee's flexion among the coordinates.
-        crossing: indices of the c muscles across the knee, without the extensor group, shape (c,).
-        lines: lines of action of these c muscles.
-        status: "ok" or "failed: …".
+        crossing: indices of the c muscles across the knee, without the extensor group, (c,).
         both_loaded: whether the forces keep the least share of load on each condyle, if required.
     """
 
@@ -162,7 +158,7 @@ class FlexionRow:
     Args:
         moment: moment on the tibia about the insert's z from muscles and reserve together, N·m.
         extensor_arm: moment arm of the extensor group, m.
-        arms: moment arms of the crossing muscles, shape (c,), m.
+        arms: moment arms of the crossing muscles, (c,), m.
     """
 
     moment: float

@@ -77,9 +77,9 @@ class RelativeTwists:
     """Twists of the knee's bodies per joint velocity, in the insert frame of the user's knee.
 
     Args:
-        femur: xi relative to the insert, shape (6, nv).
-        patella: xi of the link "patella" relative to the insert, shape (6, nv).
-        coordinates: derivative of the patella's coordinates, shape (3, nv), if the model has one.
+        femur: xi relative to the insert, (6, nv).
+        patella: xi of the link "patella" relative to the insert, (6, nv).
+        coordinates: derivative of the patella's coordinates, (3, nv), if the model has one.
     """
 
     femur: Array

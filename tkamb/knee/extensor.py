@@ -227,9 +227,8 @@ class ExtensorFrames:
     """The patella over the frames of a motion.
 
     Args:
-        time: times of the frames, shape (f,), s.
-        poses: pose_femur_in_insert, shape (f, 4, 4).
-        recorded: patella coordinates, rates and accelerations, shape (f, 3, 3); None: the patella
+        poses: pose_femur_in_insert, (f, 4, 4).
+        recorded: patella coordinates, rates and accelerations, (f, 3, 3); None: the patella
             is solved.
         rates: function of time (n,) and coordinates (n, 3). It returns the filtered coordinates and
             their first and second derivatives.

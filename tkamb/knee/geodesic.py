@@ -57,9 +57,9 @@ def planar_starts(
     `shortest_strings`.
 
     Returns:
-        Points where the two strings meet the sphere, shape (f, 2, 3). Their lengths on the
-        ellipsoid in s steps of equal angle, m, shape (f, 2, s). Mask of the second strings that may
-        lead to a shorter geodesic, shape (f,).
+        Points where the two strings meet the sphere, (f, 2, 3). Their lengths on the
+        ellipsoid in s steps of equal angle, m, (f, 2, s). Mask of the second strings that may
+        lead to a shorter geodesic, (f,).
     """
     planes = _Planes.through(p, q)
     points = planes.points(_ENDS)
@@ -89,11 +89,11 @@ class _Planes:
     """k half planes through each line from p to q, and the circles that they cut from the sphere.
 
     Args:
-        along: direction of the line, shape (f, 1, 3).
-        outward: direction in the half plane, normal to the line, shape (f, k, 3).
-        centre: centre of the circle, shape (f, k, 3).
+        along: direction of the line, (f, 1, 3).
+        outward: direction in the half plane, normal to the line, (f, k, 3).
+        centre: centre of the circle, (f, k, 3).
         ends: angles from `outward` towards `along` at which the taut string meets and leaves the
-            circle, rad, shape (2, f, k).
+            circle, rad, (2, f, k).
     """
 
     along: Array
@@ -181,11 +181,11 @@ class Strings:
     """Strings over an ellipsoid, in its frame.
 
     Args:
-        entry: points where the strings meet the ellipsoid, m, shape (f, 3).
-        exit: points where the strings leave the ellipsoid, m, shape (f, 3).
-        arc_m: lengths on the ellipsoid, m, shape (f,).
-        length_m: whole lengths, m, shape (f,).
-        converged: mask of the taut strings, for which the iteration has converged, shape (f,).
+        entry: points where the strings meet the ellipsoid, m, (f, 3); they leave it at
+            `exit`.
+        arc_m: lengths on the ellipsoid, m, (f,).
+        length_m: whole lengths, m, (f,).
+        converged: mask of the taut strings, for which the iteration has converged, (f,).
     """
 
     entry: Array
@@ -199,11 +199,10 @@ def shortest_strings(start: Array, end: Array, axes: Array, half: Array | None =
     """Return the shortest strings around an ellipsoid.
 
     Args:
-        start: points outside the ellipsoid, m, shape (f, 3).
-        end: points outside the ellipsoid, m, shape (f, 3). The segment from start to end passes
-            through the ellipsoid.
-        axes: semi-axes, m, shape (3,).
-        half: direction of the half on which the string must touch, shape (3,); None: either half.
+        start: points outside the ellipsoid, m, (f, 3), like `end`; the segment between them
+            passes through the ellipsoid.
+        axes: semi-axes, m, (3,).
+        half: direction of the half on which the string must touch, (3,); None: either half.
 
     Returns:
         The strings. If there is no taut string on the half, `converged` is False.
@@ -349,10 +348,10 @@ def _follow_geodesics(
     """Integrate geodesics and their Jacobi fields, in place, by an explicit Runge-Kutta method.
 
     Args:
-        states: (x, v, j, j') at the starts, replaced by the values at the ends, shape (f, 8).
-        pieces: lengths of the steps, m, shape (f, s).
-        weights: weights of the earlier stages in each of the k stages, shape (k, k).
-        last_weights: weights of the stages in a step, shape (k,).
+        states: (x, v, j, j') at the starts, replaced by the values at the ends, (f, 8).
+        pieces: lengths of the steps, m, (f, s).
+        weights: weights of the earlier stages in each of the k stages, (k, k).
+        last_weights: weights of the stages in a step, (k,).
     """
     count = len(last_weights)
     stages, point, gradient = np.empty((count, 8)), np.empty(8), np.empty(3)

@@ -65,17 +65,15 @@ def implicit_step(
     """Return q and v after one time step.
 
     Args:
-        knee: the knee on the model that moves.
-        q: configuration, shape (nq,).
-        v: velocity, shape (nv,).
-        step: time step, s.
-        tau: torques and forces of the joints, shape (nv,), N·m and N; None: zero.
+        q: configuration, (nq,).
+        v: velocity, (nv,).
+        step: s.
+        tau: torques and forces of the joints, (nv,), N·m and N; None: zero.
         fext: external forces on the joints, as `fext` of `pin.aba`; None: zero.
         tensions: muscle -> tension, N, as for `Knee.external_forces`.
         theta: 0.5: implicit midpoint; 1: implicit Euler.
-        friction_of_joints: viscous friction of the joints, shape (nv,), N·s/m or N·m·s/rad; None:
+        friction_of_joints: viscous friction of the joints, (nv,), N·s/m or N·m·s/rad; None:
             zero.
-        data: data from `Knee.create_data`, to save time.
         linear: True: one Newton step, the linearly implicit method of first order. It takes a third
             of the time or less, and does not check the residual of the step.
 

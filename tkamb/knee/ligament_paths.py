@@ -28,9 +28,9 @@ class BundlePaths:
     """Taut paths of n bundles at poses of leading shape (...).
 
     Args:
-        length: lengths, m, shape (n, ...); NaN if there is no taut path.
+        length: lengths, m, (n, ...); NaN if there is no taut path.
         points: proximal end, points where the path meets and leaves each of w surfaces, distal end,
-            m, shape (n, ..., 2 + 2w, 3). For a surface that is not touched the point before it is
+            m, (n, ..., 2 + 2w, 3). For a surface that is not touched the point before it is
             repeated.
         wrenches: link -> force and moment about the origin per newton of tension, shape
             (n, ..., 6).

@@ -40,9 +40,6 @@ class Ligament:
     Tension acts along the taut path (`tkamb.knee.ligament_paths`).
 
     Args:
-        name: name of the bundle.
-        proximal: proximal end.
-        distal: distal end.
         law: tension by length: `TwoLine(stiffness=...)` with N/m, `QuadraticToe(stiffness=...)`
             with N per unit strain, or another `LigamentLaw`.
         slack_length: slack length, m; NaN: it is computed from the reference strain.
@@ -133,9 +130,9 @@ class BundleArrays:
     """Bundles between two bodies: arrays of m straight bundles, and the bundles that wrap.
 
     Args:
-        proximal: proximal ends in one frame, shape (m, 3), m.
-        distal: distal ends in one frame, shape (m, 3), m.
-        slack_length: slack lengths, shape (m,), m.
+        proximal: proximal ends in one frame, (m, 3), m.
+        distal: distal ends in one frame, (m, 3), m.
+        slack_length: slack lengths, (m,), m.
         wrapping: bundles that wrap, with the links `PROXIMAL` and `DISTAL`.
     """
 
@@ -332,7 +329,7 @@ def strain_table(
 
     Args:
         poses: link -> pose_link_in_insert (f, 4, 4).
-        flexion: flexion in these frames, shape (f,), rad.
+        flexion: flexion in these frames, (f,), rad.
         at_deg: flexions at which the strain is computed, in the nearest recorded frame, deg.
         within_deg: largest difference of that frame's flexion, deg; beyond it the strain is NaN.
     """
@@ -447,7 +444,7 @@ def generic_ligaments(
     Args:
         femoral: surface of the femoral component in the femur link's frame (right knee).
         insert: surface of the insert in the insert frame.
-        pose_insert_in_tibia: pose, shape (4, 4).
+        pose_insert_in_tibia: pose, (4, 4).
         chosen: names of the patient's ligaments, some of MCL, LCL, PCL, ACL.
 
     Returns:

@@ -31,9 +31,9 @@ class PointForces:
     """Forces on one link, at one frame of the motion, insert frame.
 
     Args:
-        points: points of application, shape (m, 3), m.
-        forces: forces, or forces per unit of an unknown magnitude, shape (m, 3), N.
-        moment: free moment on the same link, shape (3,), N·m.
+        points: points of application, (m, 3), m.
+        forces: forces, or forces per unit of an unknown magnitude, (m, 3), N.
+        moment: free moment on the same link, (3,), N·m.
     """
 
     link: str

@@ -61,7 +61,6 @@ class Muscle:
     """A muscle or tendon through points on links.
 
     Args:
-        name: name of the muscle.
         points: points from origin to insertion, at least two.
         wrap: wrapping of the femoral component by the segment that leaves the femur; None: this
             segment is straight.
@@ -81,8 +80,6 @@ class PatellarLigament:
     """The patellar ligament: one line from the patella to the tibial tuberosity.
 
     Args:
-        proximal: end on the patella.
-        distal: end on the tibia.
         wrap: wrapping of the insert's front lip; None: the ligament is straight.
         length: constant length, which determines the position of the patella, m; NaN: not needed.
     """
@@ -98,9 +95,8 @@ class Wrap:
     """An outline that one segment of a line wraps.
 
     Args:
-        link: name of the link with the outline; the reaction acts on this link.
-        outline: convex polygon in the link's x-y plane, shape (n, 2), m.
-        segment: number of the segment; segment 0 is between the first two points.
+        outline: convex polygon in the link's x-y plane, (n, 2), m.
+        segment: segment 0 is between the first two points.
     """
 
     link: str
@@ -113,9 +109,8 @@ class Line:
     """A line of action: a string through points of the links.
 
     Args:
-        name: name of the muscle or ligament, for messages.
-        points: points from the proximal to the distal end, at least two.
-        wrap: outline that the line wraps; None: the line is straight from point to point.
+        points: from the proximal to the distal end, at least two.
+        wrap: outline that the line wraps; None: straight from point to point.
     """
 
     name: str
@@ -124,9 +119,6 @@ class Line:
 
     def path(self, poses: Mapping[str, Array]) -> "TautPath":
         """Return the taut path in the insert frame.
-
-        Args:
-            poses: link -> pose_link_in_insert (4, 4).
 
         Raises:
             ComputationError: an end of the wrapped segment lies inside the outline.
@@ -240,8 +232,7 @@ class TensionLine:
     """A straight line of given tension between points of a user's model.
 
     Args:
-        frames: frame of each point.
-        positions: position (3,) of each point in its frame, m.
+        positions: (3,), m, of each point in its frame.
     """
 
     frames: tuple[FixedFrame, ...]

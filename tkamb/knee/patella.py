@@ -52,12 +52,12 @@ class PatellaState:
     """The patella at one frame.
 
     Args:
-        coordinates: patella_ap, patella_si (m) and patella_rotation (rad), shape (3,); NaN: not
+        coordinates: patella_ap, patella_si (m) and patella_rotation (rad), (3,); NaN: not
             found.
-        contact_point: on the line of action of the contact force, insert frame, shape (3,), m.
+        contact_point: on the line of action of the contact force, insert frame, (3,), m.
         contact_normal: unit normal from femur to patella in the femur's sagittal plane, insert
-            frame, shape (3,).
-        contact_on_patella: contact point in the patella's frame, shape (3,), m.
+            frame, (3,).
+        contact_on_patella: contact point in the patella's frame, (3,), m.
         gap: distance of button and femoral component, negative in penetration, m.
         ligament_ratio: patellar ligament tension per muscle tension, for a massless patella.
         patellofemoral_ratio: patellofemoral force per muscle tension, for a massless patella.
@@ -65,7 +65,7 @@ class PatellaState:
         tilt: first-order estimate of the tilt about y, rad. The computed patella does not shift or
             tilt.
         slopes: approximate derivatives of gap, ligament length and moment per unit tension (m) by
-            the coordinates, shape (3, 3), as input of a later search; None: unknown.
+            the coordinates, (3, 3), as input of a later search; None: unknown.
     """
 
     coordinates: Array
@@ -86,16 +86,14 @@ class ExtensorMechanism:
     """The extensor mechanism as input of the search for the patella, constant over frames.
 
     Args:
-        contact: contact of button and femoral component, in the patellar joint's frame.
-        pose_joint_in_femur: pose of the patellar joint's frame in the femur link, shape (4, 4).
-        muscle_origin: start of the segment that leaves the femur, femur frame, shape (3,), m.
-        muscle_insertion: end of the muscle, patella frame, shape (3,), m.
-        ligament_proximal: proximal end of the ligament, patella frame, shape (3,), m.
-        ligament_distal: distal end of the ligament, insert frame, shape (3,), m.
-        ligament_length: constant length of the patellar ligament, m.
-        femoral_outline: outline that the muscle wraps, in the femur's x-y plane, shape (n, 2), m;
+        pose_joint_in_femur: pose of the patellar joint's frame in the femur link, (4, 4).
+        muscle_origin: start of the segment that leaves the femur, femur frame, (3,), m.
+        muscle_insertion: patella frame, (3,), m; `ligament_proximal` too.
+        ligament_distal: insert frame, (3,), m.
+        ligament_length: constant, m.
+        femoral_outline: outline that the muscle wraps, in the femur's x-y plane, (n, 2), m;
             None: no wrapping.
-        insert_outline: outline that the ligament wraps, in the insert's x-y plane, shape (n, 2), m;
+        insert_outline: outline that the ligament wraps, in the insert's x-y plane, (n, 2), m;
             None: no wrapping.
     """
 

@@ -82,11 +82,10 @@ class PatellarContact:
 
     Args:
         gap: gap, negative in penetration, m.
-        point: point of the line of action that is nearest to the mean contact point, shape (3,), m.
-        normal: unit normal from femur to patella, in the sagittal plane, shape (3,).
+        point: point of the line of action that is nearest to the mean contact point, (3,), m.
+        normal: unit normal from femur to patella, in the sagittal plane, (3,).
         share_left: lambda, share of the force on the -z side.
-        shift: first-order estimate of the patella's shift along z, m.
-        tilt: first-order estimate of the patella's tilt about y, rad.
+        shift: first-order estimate along z, m; `tilt`: about y, rad.
         on_edge: share of the force on sharp or open edges of the femoral mesh.
     """
 
@@ -219,9 +218,9 @@ def _samples_to_update(
     since then. These bounds exclude samples without weight.
 
     Args:
-        samples: present positions of the samples, shape (n, 3), m.
-        last_position: position of each sample at its last evaluation, shape (n, 3), m; inf: none.
-        distance: signed distance at that position, shape (n,), m.
+        samples: present positions of the samples, (n, 3), m.
+        last_position: position of each sample at its last evaluation, (n, 3), m; inf: none.
+        distance: signed distance at that position, (n,), m.
     """
     count, nearest = len(samples), np.full(2, np.inf)
     displacement, indices, number = np.full(count, np.inf), np.empty(count, np.int64), 0
@@ -260,14 +259,14 @@ def _store_samples(
     """Store the distances, nearest points and normals of m of the n samples.
 
     Args:
-        indices: indices of the samples, shape (m,).
-        samples: positions of all samples, shape (n, 3), m.
-        unsigned: their unsigned distances, shape (m,), m, like `faces` and barycentric `weights`.
-        smooth_normals: unit normals at the corners, shape (k, 3, 3). They jump at sharp edges.
-        vertex_normals: the same as means over each vertex, shape (k, 3, 3).
-        sharp: whether the edge opposite each corner is sharp or open, shape (k, 3).
+        indices: indices of the samples, (m,).
+        samples: positions of all samples, (n, 3), m.
+        unsigned: their unsigned distances, (m,), m, like `faces` and barycentric `weights`.
+        smooth_normals: unit normals at the corners, (k, 3, 3). They jump at sharp edges.
+        vertex_normals: the same as means over each vertex, (k, 3, 3).
+        sharp: whether the edge opposite each corner is sharp or open, (k, 3).
         last_position: output like all following, see `_samples_to_update`.
-        on_edge: 1 if the nearest point is on a sharp or open edge, else 0, shape (n,).
+        on_edge: 1 if the nearest point is on a sharp or open edge, else 0, (n,).
     """
     outward = np.empty(3)
     for m in range(len(indices)):
@@ -335,11 +334,11 @@ def _contact_of_sides(sides: Array, middle: float, compliances: Array, contact: 
     """Compute the contact by the module's equations, and return the normal's sagittal part.
 
     Args:
-        sides: gap, point, normal and share on edges of the left and the right side, shape (2, 8).
+        sides: gap, point, normal and share on edges of the left and the right side, (2, 8).
         middle: z of the patella's middle, m.
         compliances: c (m) and d (rad/m).
         contact: output: gap, share of the left, shift, tilt, share on edges, point (3,) and normal
-            (3,) of the line of action in the sagittal plane, shape (`FIELDS`,).
+            (3,) of the line of action in the sagittal plane, (`FIELDS`,).
     """
     # The gap is a parabola in the share of the left side. At its minimum, shift and tilt are in
     # equilibrium.

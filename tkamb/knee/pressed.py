@@ -35,7 +35,6 @@ class KneeContactResult(ContactResult):
         pose: `pin.SE3`, pose of the femoral component in the insert frame.
         of_right_knee: the result of the equations, which are those of a right knee: the mirror
             image for a left knee.
-        left: whether the knee is a left one.
     """
 
     pose: Any
@@ -59,7 +58,6 @@ class KneePatellaResult:
         button_in_patella: `pin.SE3`, pose of the button frame in the frame "patella".
         on_patella: `pin.Force` of the contact on the patella, in the frame "patella".
         on_femoral: `pin.Force` of the contact on the femoral component, in the frame "femoral".
-        flags: warnings in words.
     """
 
     contact: KneeContactResult
@@ -130,13 +128,12 @@ class PressBatch:
     """The presses of n poses. A press that failed has NaN; an unloaded condyle has zero.
 
     Args:
-        results: the result of each pose.
-        force: contact forces of the medial and lateral condyle, shape (n, 2), N.
-        peak_pressure: their peak pressures, shape (n, 2), Pa.
-        area: their contact areas, shape (n, 2), m².
-        approach: travel along -y since first touch, shape (n,), m.
-        pose: pose of the femoral component, shape (n, 4, 4).
-        pressure: pressure at the map points, shape (n, p), Pa.
+        force: contact forces of the medial and lateral condyle, (n, 2), N.
+        peak_pressure: their peak pressures, (n, 2), Pa.
+        area: their contact areas, (n, 2), m².
+        approach: travel along -y since first touch, (n,), m.
+        pose: pose of the femoral component, (n, 4, 4).
+        pressure: pressure at the map points, (n, p), Pa.
         derivatives: derivatives of each press; empty: not asked for.
     """
 
@@ -158,7 +155,7 @@ class PressBatch:
 
     @property
     def failed(self) -> Array:
-        """Whether each press failed, shape (n,)."""
+        """Whether each press failed, (n,)."""
         return np.array([one.failed for one in self.results], bool)
 
     @property

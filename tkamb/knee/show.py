@@ -57,10 +57,8 @@ def show_knee(
 
     Args:
         viewer: a `pin.visualize.MeshcatVisualizer`, or a `meshcat.Visualizer`.
-        q: configuration, shape (nq,).
         contact: contact from `Knee.press` or `Knee.evaluate`; the femur is drawn at its pose. None:
             the contact at q.
-        node: name of the node in the viewer's tree.
         newton: length of an arrow per newton, m/N.
         peak: pressure of the last colour, Pa; None: the peak pressure.
         opacity: opacity of the femoral component, 0 to 1.

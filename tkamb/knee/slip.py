@@ -34,9 +34,9 @@ class CondyleSlip:
     All values are NaN from the first frame in which the condyle does not lie over the insert.
 
     Args:
-        femoral_arc: arc on the femoral surface, positive backwards, shape (f,), m.
-        insert_arc: arc on the insert, positive backwards, shape (f,), m.
-        axial_part: part of `insert_arc` due to axial rotation, shape (f,), m.
+        femoral_arc: arc on the femoral surface, positive backwards, (f,), m.
+        insert_arc: arc on the insert, positive backwards, (f,), m.
+        axial_part: part of `insert_arc` due to axial rotation, (f,), m.
     """
 
     femoral_arc: Array
@@ -105,10 +105,10 @@ def slip_of_points(
     """Return rolling and slipping of one condyle from its lowest points.
 
     Args:
-        points: lowest points of the condyle, insert frame, shape (f, 3), m.
-        poses: pose_femoral_in_insert, shape (f, 4, 4).
-        axial_rotation: positive if the femur rotates externally, shape (f,), rad.
-        centre_z: z of the component's geometric centre, insert frame, shape (f,), m.
+        points: lowest points of the condyle, insert frame, (f, 3), m.
+        poses: pose_femoral_in_insert, (f, 4, 4).
+        axial_rotation: positive if the femur rotates externally, (f,), rad.
+        centre_z: z of the component's geometric centre, insert frame, (f,), m.
     """
     height, slope = profile.at(points)
     on_insert = np.column_stack([points[:, 0], height])
@@ -188,12 +188,12 @@ def roll_slip_motion(
 
     Args:
         split: z between the condyles in the femoral frame, m; None: one condyle.
-        coordinates: knee coordinates, shape (f, 6), m and rad. Their rotations, ML, and the AP of
+        coordinates: knee coordinates, (f, 6), m and rad. Their rotations, ML, and the AP of
             the first frame are used.
-        slip: cumulated slip, positive forwards, shape (f,), m; zero: pure rolling.
+        slip: cumulated slip, positive forwards, (f,), m; zero: pure rolling.
 
     Returns:
-        Knee coordinates, shape (f, 6), m and rad. AP and SI are NaN from the first frame in which
+        Knee coordinates, (f, 6), m and rad. AP and SI are NaN from the first frame in which
         the femur leaves the insert.
     """
     changed = np.array(coordinates, float)

@@ -38,8 +38,8 @@ class PressDerivatives:
     """Derivatives of a press. The rows are those of `PRESS_ROWS`, N and m.
 
     Args:
-        by_load: derivative by the load, shape (4,), 1 and m/N.
-        by_pose: derivative by a displacement of the femur at the pressed pose, shape (4, 6): the
+        by_load: derivative by the load, (4,), 1 and m/N.
+        by_pose: derivative by a displacement of the femur at the pressed pose, (4, 6): the
             translation (m) of its point at the insert's origin, then the rotation (rad), in the
             insert frame. The press then changes the height; the translation along y has no effect.
     """
@@ -123,12 +123,12 @@ class EquilibriumDerivatives:
     the medial and the lateral condyle.
 
     Args:
-        by_load: by a wrench on the tibia about the insert's origin, shape (8, 6), N and N·m, in
+        by_load: by a wrench on the tibia about the insert's origin, (8, 6), N and N·m, in
             addition to `external`, in the insert frame.
-        by_coordinate: by the knee coordinates that are not released, shape (8, 6), m and rad. The
+        by_coordinate: by the knee coordinates that are not released, (8, 6), m and rad. The
             columns of released coordinates are zero.
-        by_slack_length: by the slack length of each ligament, shape (8, m), per m.
-        by_stiffness: by the stiffness of each ligament, shape (8, m), per unit of its law.
+        by_slack_length: by the slack length of each ligament, (8, m), per m.
+        by_stiffness: by the stiffness of each ligament, (8, m), per unit of its law.
     """
 
     by_load: Array

@@ -50,11 +50,10 @@ class WrapTouch:
     """Touching points of f strings on a wrap object, in its frame.
 
     Args:
-        touches: mask of the strings that touch, shape (f,). Other values hold only for these.
-        entry: points where the strings meet the object, m, shape (f, 3).
-        exit: points where the strings leave the object, m, shape (f, 3).
-        arc_m: lengths on the object, m, shape (f,).
-        push: force of a shrinking object on start and end, per unit tension, shape (f, 2, 3).
+        touches: mask of the strings that touch, (f,). Other values hold only for these.
+        entry: points where the strings meet the object, m, (f, 3); they leave it at `exit`.
+        arc_m: lengths on the object, m, (f,).
+        push: force of a shrinking object on start and end, per unit tension, (f, 2, 3).
     """
 
     touches: Mask
@@ -287,11 +286,11 @@ class WrappedStrings:
     """f strings over w objects.
 
     Args:
-        order: indices of the objects that a string touches, from start to end, then -1, shape (f,
+        order: indices of the objects that a string touches, from start to end, then -1, (f,
             w).
-        entry: points where the strings meet the objects, m, shape (f, w, 3); `exit`: leave.
-        arc_m: lengths on the objects, m, shape (f, w); NaN if the iteration has not converged.
-        push: force of a shrinking object on start and end, per unit tension, shape (f, w, 2, 3).
+        entry: points where the strings meet the objects, m, (f, w, 3); `exit`: leave.
+        arc_m: lengths on the objects, m, (f, w); NaN if the iteration has not converged.
+        push: force of a shrinking object on start and end, per unit tension, (f, w, 2, 3).
     """
 
     order: Index
@@ -313,9 +312,9 @@ def strings_over(
 
     Args:
         wraps: w objects, in the order in which they are tried.
-        poses: of the objects in the frame of the points, shape (f, w, 4, 4).
-        allowed: whether a string may touch an object, shape (f, w).
-        moves: whether start and end belong to another body than object w, shape (f, w, 2).
+        poses: of the objects in the frame of the points, (f, w, 4, 4).
+        allowed: whether a string may touch an object, (f, w).
+        moves: whether start and end belong to another body than object w, (f, w, 2).
     """
     strings = _Strings(wraps, poses, start, end, moves)
     if len(wraps) == 1:
@@ -370,7 +369,7 @@ class _Strings:
         return WrappedStrings(self.order, self.entry, self.exit, self.arc, self.push)
 
     def places(self) -> Array:
-        """Return the touching points of each string in one row, m, shape (f, 6w)."""
+        """Return the touching points of each string in one row, m, (f, 6w)."""
         return np.concatenate([self.entry, self.exit], axis=2).reshape(len(self.start), -1)
 
     def place(self, places: Array) -> None:
@@ -427,10 +426,10 @@ class StraightParts:
     """The p straight parts of paths between different bodies.
 
     Args:
-        frame: index of the coordinate set, in flattened order, shape (p,).
-        line: index of the muscle or ligament, shape (p,).
-        bodies: indices of the bodies at the start and end of each part, shape (p, 2).
-        ends: start and end of each part in ground, m, shape (p, 2, 3).
+        frame: index of the coordinate set, in flattened order, (p,).
+        line: index of the muscle or ligament, (p,).
+        bodies: indices of the bodies at the start and end of each part, (p, 2).
+        ends: start and end of each part in ground, m, (p, 2, 3).
     """
 
     frame: Index

@@ -60,9 +60,8 @@ class CondylePoint:
     """The contact point of one condyle on the insert, insert frame.
 
     Args:
-        point: position, shape (3,), m.
-        normal: unit normal from the insert to the femur, shape (3,).
-        sliding: velocity of the femur relative to the insert at the point, shape (3,), m/s.
+        normal: unit normal from the insert to the femur, (3,).
+        sliding: velocity of the femur relative to the insert at the point, (3,), m/s.
         gap: gap, positive when apart, m.
     """
 
@@ -88,7 +87,6 @@ class Unknown:
     """A load of unknown magnitude.
 
     Args:
-        name: name of the magnitude in the solution.
         loads: loads on the links at a magnitude of one, insert frame.
     """
 
@@ -103,7 +101,6 @@ class Solution:
     Args:
         values: name -> magnitude, N or N·m.
         condition: 2-norm condition number of the matrix with unit columns.
-        regular: whether the values may be used.
     """
 
     values: dict[str, float]
@@ -228,7 +225,7 @@ def residuals(point: Array, lifted: bool, extensor: bool) -> list[Unknown]:
     """Return the residuals, loads on the tibia that are zero in an exact model.
 
     Args:
-        point: midpoint of the contact points, where the residual forces act, shape (3,), m.
+        point: midpoint of the contact points, where the residual forces act, (3,), m.
         lifted: a coronal moment replaces the force of a lifted condyle.
         extensor: if the extensor group does not act, a flexion moment is another residual.
     """

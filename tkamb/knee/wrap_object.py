@@ -28,7 +28,6 @@ class WrapObject:
     """A surface fixed to a body, around which strings wrap.
 
     Args:
-        name: the object's name.
         shape: "cylinder" (along its z), "sphere", "ellipsoid", "torus" (about its z) or "section"
             (along its z).
         pose: (4, 4) pose_object_in_body.
@@ -36,8 +35,7 @@ class WrapObject:
             torus: radius of the centre line, radius of the tube; section: none.
         quadrant: axis (0, 1 or 2) and sign (±1) of the half on which paths must lie; None: either
             half.
-        active: whether paths wrap around the object.
-        outline: of a "section": strictly convex polygon in x-y, counter-clockwise, shape (n, 2), m.
+        outline: of a "section": strictly convex polygon in x-y, counter-clockwise, (n, 2), m.
 
     Raises:
         InputError: dimensions or outline do not suit the shape.
@@ -112,9 +110,6 @@ def mesh_section(
     """Return the convex section of a mesh as a wrap object.
 
     Args:
-        name: name of the object.
-        body: body that carries the surface.
-        surface: surface in the body's frame.
         pose: (4, 4) pose of the section in the body: z along the normal of the section's plane, x
             to the side on which strings pass, y from their last to their first points.
         band: half of the width along z across which sections are joined, m.

@@ -30,7 +30,7 @@ class TautPath:
     """A taut path at one instant.
 
     Args:
-        points: start, touched corners of the outline, end, shape (m, 3), m.
+        points: start, touched corners of the outline, end, (m, 3), m.
         length: length of the path, m.
         wrap_angle: change of direction in the bone's sagittal plane, rad; 0: straight.
     """

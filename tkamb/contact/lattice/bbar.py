@@ -24,7 +24,7 @@ from tkamb.geometry.frames import Array, Index
 
 _VALUES, _VECTORS = np.linalg.eigh(DEVIATORIC)
 _ROOT = (_VECTORS * np.sqrt(np.maximum(_VALUES, 0))).T[_VALUES > 1e-12]
-"""R, shape (5, 6), with Rᵀ R = `DEVIATORIC`."""
+"""R, (5, 6), with Rᵀ R = `DEVIATORIC`."""
 
 
 class BbarHexahedra(Solid):

@@ -79,10 +79,10 @@ class SurfaceDerivatives:
     """Derivatives of the femoral surface over n positions.
 
     Args:
-        slope: m, shape (n, 3).
-        turn: G, 1/m, shape (n, 3, 3).
-        rise: dH by a displacement of the femur, shape (n, 6).
-        normal: dn by a displacement of the femur, shape (n, 3, 6).
+        slope: m, (n, 3).
+        turn: G, 1/m, (n, 3, 3).
+        rise: dH by a displacement of the femur, (n, 6).
+        normal: dn by a displacement of the femur, (n, 3, 6).
     """
 
     slope: Array

@@ -66,10 +66,10 @@ class ContactProblem:
 
     Args:
         operator: factor of the linear stiffness.
-        index: lattice index of each node, shape (n, 3).
-        held: mask of the unknowns held by the boundary, shape (3n,).
+        index: lattice index of each node, (n, 3).
+        held: mask of the unknowns held by the boundary, (3n,).
         direction: of the contact forces: along the femoral normal, or vertical (Sharma 2008).
-        lift: height of the smooth surface above the contact nodes, m, shape (c,), or 0.
+        lift: height of the smooth surface above the contact nodes, m, (c,), or 0.
     """
 
     solid: Solid
@@ -169,8 +169,8 @@ class Region:
     """A subset of the elements (cells or springs) of a solid.
 
     Args:
-        elements: numbers of the elements, increasing, shape (k,).
-        nodes: their nodes that are not held, shape (m,).
+        elements: numbers of the elements, increasing, (k,).
+        nodes: their nodes that are not held, (m,).
         fronts: fronts of the factor that a solve for these nodes needs.
     """
 

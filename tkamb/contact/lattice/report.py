@@ -48,7 +48,7 @@ COLLAPSE_STRAIN = -1.0
 
 
 AROUND = np.array([(x, 0.0, z) for x in (-1, 0, 1) for z in (-1, 0, 1)], float)
-"""Directions along x, z and the diagonals, with the centre in the middle row, shape (9, 3)."""
+"""Directions along x, z and the diagonals, with the centre in the middle row, (9, 3)."""
 
 
 def unresolved_flags(state: LatticeState, result: ContactResult) -> tuple[str, ...]:
@@ -163,9 +163,9 @@ def result_of(
     """Return the result of a solution.
 
     Args:
-        pose: pose at approach 0 of the solution, shape (4, 4).
+        pose: pose at approach 0 of the solution, (4, 4).
         load: N, or None if the pose was given.
-        gaps: vertical gaps at that pose, m, shape (c,).
+        gaps: vertical gaps at that pose, m, (c,).
         rule: rule for the area that a nodal force acts on.
         forces_only: the solution is that of the region, and nothing is flagged.
     """

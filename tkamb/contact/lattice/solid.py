@@ -39,7 +39,6 @@ class ShearCurve:
     """The curve q(e) of equivalent stress over equivalent deviatoric strain.
 
     Args:
-        shear_modulus: mu at zero strain, Pa.
         spline: q(e), Pa, or None for a linear material.
     """
 
@@ -92,9 +91,9 @@ class Pattern:
     """The places of element matrices (of cells or springs) in the global matrix.
 
     Args:
-        indptr: first block of each node's row, then the number of blocks, shape (n + 1,).
-        indices: column node of each block, shape (b,).
-        slot: block of each ordered node pair of each element of p nodes, shape (c, p²).
+        indptr: first block of each node's row, then the number of blocks, (n + 1,).
+        indices: column node of each block, (b,).
+        slot: block of each ordered node pair of each element of p nodes, (c, p²).
     """
 
     indptr: Index
@@ -198,14 +197,13 @@ class Solid(ABC):
     """A solid of eight-node cells, small strain.
 
     Args:
-        nodes: m, shape (n, 3).
-        cells: nodes of the cells in VTK hexahedron order, shape (c, 8).
-        spacing: edges of the lattice's box cell, m, shape (3,).
-        material: E, nu and stress-strain law.
+        nodes: m, (n, 3).
+        cells: nodes of the cells in VTK hexahedron order, (c, 8).
+        spacing: edges of the lattice's box cell, m, (3,).
 
     Attributes:
-        gradients: mean gradients of the cells' shape functions, 1/m, shape (c, 8, 3).
-        volume: volumes of the cells, m³, shape (c,).
+        gradients: mean gradients of the cells' shape functions, 1/m, (c, 8, 3).
+        volume: volumes of the cells, m³, (c,).
 
     Raises:
         InputError: a cell is turned inside out.

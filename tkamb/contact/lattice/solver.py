@@ -62,14 +62,10 @@ class Solution:
     """The state at which the iteration stopped, with its measured residual.
 
     Args:
-        candidates: indices of the candidates in the list of contact nodes, shape (m,).
-        forces: contact forces along the normals, approach and active set.
-        planes: femoral points and normals of the candidates.
-        displacement: displacement of the candidates, m, shape (m, 3).
-        field: displacement of all nodes, m, shape (n, 3); None for a linear material.
-        loads: h, N, shape (n, 3), for a warm start; None for a linear material.
-        residual: residual of the whole solid.
-        region: region for a warm start, or None.
+        candidates: indices of the candidates in the list of contact nodes, (m,).
+        displacement: displacement of the candidates, m, (m, 3).
+        field: displacement of all nodes, m, (n, 3); None for a linear material.
+        loads: h, N, (n, 3), for a warm start; None for a linear material.
         softening: s for a warm start.
         half: L⁻¹ h in elimination order for a warm start, or None.
     """
@@ -152,10 +148,10 @@ def solve_pass(
     """Return the contact on given femoral planes, and the candidates' displacement (m, 3), m.
 
     Args:
-        offset: candidates' displacement without contact forces, m, shape (m, 3).
-        points: undeformed candidates, m, shape (m, 3).
+        offset: candidates' displacement without contact forces, m, (m, 3).
+        points: undeformed candidates, m, (m, 3).
         load: N, or None for approach 0.
-        active: first guess of the active set, shape (m,).
+        active: first guess of the active set, (m,).
     """
     along, vectors = response.along(planes.normals)
     forces = solve_contact(along, planes.gap(points + offset), planes.normal_y, load, active)

@@ -209,7 +209,6 @@ class SourceLattice(CellContact):
         law: "nonlinear" (the material's curve for every spring) or "linear".
         loops: "stored" (the solver of the other lattice models) or "source" (Sharma's own
             displacement-driven loops; the same result, slower).
-        pressure_rule: "source" by default.
     """
 
     name: ClassVar[str] = "lattice-source"
@@ -252,8 +251,8 @@ class _Pressed:
     """Equilibrium at one D.
 
     Args:
-        force: vertical forces on the candidates, N, shape (m,).
-        field: displacement of all nodes, m, shape (n, 3).
+        force: vertical forces on the candidates, N, (m,).
+        field: displacement of all nodes, m, (n, 3).
         slope: change of the reaction with D, N/m; NaN for a nonlinear material.
         residual: residual of the free nodes, relative to the reaction (sums of absolute values).
     """

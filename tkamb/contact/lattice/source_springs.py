@@ -46,8 +46,8 @@ class Tangent:
     """Tangent stiffness of all deformed springs.
 
     Args:
-        stiffness: stiffness along the spring, N/m, shape (s,).
-        direction: unit vector along the spring, shape (s, 3).
+        stiffness: stiffness along the spring, N/m, (s,).
+        direction: unit vector along the spring, (s, 3).
     """
 
     stiffness: Array

@@ -31,13 +31,13 @@ NEIGHBOURS = np.array(
         for o in CORNERS
     ]
 )
-"""Number of the corner at the other end of each corner's edge along x, y and z, shape (8, 3)."""
+"""Number of the corner at the other end of each corner's edge along x, y and z, (8, 3)."""
 
 PAIRS = np.array([(a, b) for a in range(8) for b in range(a + 1, 8)])
 """The 28 pairs of a cell's corners that are joined by springs."""
 
 PAIR_AXES = np.abs(np.diff(CORNERS[PAIRS], axis=1))[:, 0]
-"""Axes along which the corners of each pair differ, 0 or 1, shape (28, 3).
+"""Axes along which the corners of each pair differ, 0 or 1, (28, 3).
 
 The sum of a row is 1 for an edge, 2 for a face diagonal and 3 for a body diagonal.
 """
@@ -89,10 +89,10 @@ class Springs:
     """The springs of a lattice, each once.
 
     Args:
-        ends: end nodes, shape (s, 2).
-        family: row of DIRECTIONS, shape (s,).
-        owners: number of cells that share the spring, shape (s,).
-        of_cell: springs of each cell, in the order of PAIRS, shape (c, 28).
+        ends: end nodes, (s, 2).
+        family: row of DIRECTIONS, (s,).
+        owners: number of cells that share the spring, (s,).
+        of_cell: springs of each cell, in the order of PAIRS, (c, 28).
     """
 
     ends: Index
@@ -164,7 +164,7 @@ def shape_gradients(at: Array) -> Array:
 
 
 REFERENCE_GRADIENTS = np.stack([shape_gradients(at) for at in _GAUSS])
-"""Gradients at the 2 x 2 x 2 Gauss points of [0, 1]³, shape (8 points, 8 nodes, 3)."""
+"""Gradients at the 2 x 2 x 2 Gauss points of [0, 1]³, (8 points, 8 nodes, 3)."""
 
 
 def _jacobians(corners: Array) -> Array:

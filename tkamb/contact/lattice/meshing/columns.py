@@ -42,11 +42,9 @@ class Levels:
     """Heights of the node layers over the columns of the grid.
 
     Args:
-        reference: height H of the reference layer, m, shape (nx, nz).
+        reference: height H of the reference layer, m, (nx, nz).
         layers: J, number of cells between the bottom and the reference layer.
-        below: number of layers under the bottom.
         spacing: spacing of the layers above the reference layer and below the bottom, m.
-        count: number of node layers.
     """
 
     reference: Array
@@ -188,12 +186,9 @@ class NodeField:
 
     Args:
         lines: x and z coordinates of the grid lines along y, m.
-        spacing: spacing of the grid, m, shape (3,).
-        points: positions of the nodes, m, shape (nx, ny, nz, 3).
-        member: mask of the nodes that belong to the part.
-        lower_end: mask of the lower ends of intervals.
-        upper_end: mask of the upper ends of intervals.
-        top: mask of the upper ends of the highest intervals.
+        points: (nx, ny, nz, 3), m.
+        member: the nodes that belong to the part.
+        lower_end, upper_end: ends of intervals; top: upper ends of the highest ones.
         interval: number of each node's interval; -1 if there is none.
         mended: number of lines with crossings corrected from their neighbours.
         closed_gaps: number of filled gaps, narrower than a cell.
@@ -231,12 +226,7 @@ class Ends:
 
 
 def place_columns(surface: Surface, spacing: Array) -> NodeField:
-    """Return the grid over the surface's bounding box, with nodes placed along y.
-
-    Args:
-        surface: closed insert, insert frame.
-        spacing: spacing of the grid, m, shape (3,).
-    """
+    """Return the grid over the surface's bounding box, with nodes placed along y."""
     x, z = (_grid_line(surface, axis, spacing[axis]) for axis in (0, 2))
     intervals = inside_intervals(surface, 1, z, x)
     i, k = intervals.second, intervals.first

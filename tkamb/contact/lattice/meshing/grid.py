@@ -75,13 +75,7 @@ def standing_pieces(cells: Index, bottom: Mask) -> Mask:
 
 @dataclass(frozen=True)
 class MissingPart:
-    """The largest part of a mesh that its lattice lacks, insert frame.
-
-    Args:
-        volume: m³.
-        extents: extents along x, y and z, m.
-        centre: centre of its bounding box, m.
-    """
+    """The largest part of a mesh that its lattice lacks, insert frame."""
 
     volume: float
     extents: tuple[float, ...]
@@ -189,13 +183,13 @@ class Lattice:
     """Nodes and cells of an insert, insert frame, SI.
 
     Args:
-        nodes: m, shape (n, 3).
-        index: index (i, j, k) of each node in the structured grid, shape (n, 3).
-        node_class: INTERNAL, CONTACT, BOTTOM or OTHER, shape (n,).
-        spacing: spacing of the undistorted grid, m, shape (3,).
-        origin: position of the grid's node (0, 0, 0), m, shape (3,).
-        cells: nodes of the cells in the order of VTK's hexahedron, shape (c, 8).
-        contact_triangles: nodes of outward triangles over the contact nodes, shape (k, 3).
+        nodes: m, (n, 3).
+        index: index (i, j, k) of each node in the structured grid, (n, 3).
+        node_class: INTERNAL, CONTACT, BOTTOM or OTHER, (n,).
+        spacing: spacing of the undistorted grid, m, (3,).
+        origin: position of the grid's node (0, 0, 0), m, (3,).
+        cells: nodes of the cells in the order of VTK's hexahedron, (c, 8).
+        contact_triangles: nodes of outward triangles over the contact nodes, (k, 3).
         dropped_nodes: number of omitted nodes, which belong to no cell.
         dropped_cells: number of omitted cells (inverted, across a gap, or in a loose piece).
         mended_rays: number of vertical lines with crossings corrected from their neighbours.

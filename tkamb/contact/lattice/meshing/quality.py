@@ -97,14 +97,10 @@ class LatticeQuality:
     """Measures of a lattice.
 
     Args:
-        volume: volume of all cells, m³.
-        mesh_volume: volume that the mesh encloses, m³.
         edge_ratio: longest over shortest edge of a cell: median, 95th percentile, largest.
         shear: angle between a cell's upright edges and the normal of its layer, rad: median, 95th
             percentile, largest.
         least_jacobian: least scaled Jacobian at a corner of a cell (1 for a box).
-        notices: corrections and omissions, in words.
-        post: the post (its contact with a cam is not modelled), or None.
     """
 
     nodes: int

@@ -72,9 +72,7 @@ class Notch:
 
     Args:
         axes: the two axes of the squares.
-        node: missing nodes.
-        first: neighbours along the first axis.
-        second: neighbours along the second axis.
+        node: missing nodes; `first` and `second` are neighbours along these axes.
         across: nodes across the diagonal.
     """
 
@@ -157,9 +155,9 @@ class WallHits:
     """The walls beside the nodes of the grid in one of the four directions.
 
     Args:
-        open: mask of the members without a cell on this side, shape (nx, ny, nz). For the end of
+        open: mask of the members without a cell on this side, (nx, ny, nz). For the end of
             an interval, the next node inside the interval must be such a member too.
-        distance: distance to the wall, m, shape (nx, ny, nz); inf if there is none.
+        distance: distance to the wall, m, (nx, ny, nz); inf if there is none.
     """
 
     open: Mask
