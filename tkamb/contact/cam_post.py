@@ -126,9 +126,6 @@ class CamPost:
     """A contact model prepared for a cam and a post, each in its own frame.
 
     The closed post is flat in front (`divide_insert`). `split` is z (m) between the condyles.
-
-    Raises:
-        InputError: the model cannot compute contact along a line, or there is no cam.
     """
 
     def __init__(
@@ -278,9 +275,6 @@ def cam_of(femoral: Surface, split: float | None, reach: float) -> Surface:
     """Return the cam: the triangles between the condyles, in the posterior half of the component.
 
     `split` and `reach`, the cam's largest distance from it, are along z (m), femoral frame.
-
-    Raises:
-        InputError: the component has no such triangle, or only one condyle.
     """
     if split is None:
         hint = "leave the key out, or give a component with two condyles"

@@ -129,7 +129,6 @@ class ArticularEdge:
 
 
 def _joined_to_outside(mask: Mask, outside: Mask) -> Mask:
-    """Return the connected parts of a mask (a, b) that contain a cell outside the insert."""
     from scipy.ndimage import label  # slow import, not needed for a report
 
     part, _ = label(mask, structure=np.ones((3, 3)))

@@ -356,7 +356,6 @@ class FoundationProbe:
         return np.array([linear, material.confined_modulus, material.young_modulus, *numbers])
 
     def _pressures(self, strain: Array) -> tuple[Array, Array]:
-        """Return the pressures (n,), Pa, at strains of the columns, and their slopes."""
         material = self._state.pair.material
         return layer_pressure(self._law, material, strain), layer_slope(self._law, material, strain)
 

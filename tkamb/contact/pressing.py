@@ -104,9 +104,6 @@ def press_by_search(
         The contact at the approach that carries the load. It is OUT_OF_RANGE, with NaN, if the load
         cannot be reached or the femoral component does not lie over the insert. It is NOT_CONVERGED
         if the reaction jumps over the load. With a load of zero it is the first touch.
-
-    Raises:
-        InputError: the load is negative or not finite.
     """
     check_load(load)
     pose = np.array(pose, float)
@@ -216,7 +213,6 @@ def search_load(reaction: Reaction, load: float, start: float, unloaded: float =
 
 
 def _ahead(trial: float, force: float, load: float) -> float:
-    """Return a larger trial approach (m), at most 4 times larger."""
     # Extrapolation with F ~ d^2, 5 % farther, so that the next trial brackets the load.
     factor = 2.0 if force <= 0 else min(1.05 * math.sqrt(load / force), 4.0)
     return min(trial * factor + 1e-9, PRESS.max_approach)

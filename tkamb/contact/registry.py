@@ -47,20 +47,12 @@ CONTACT_MODELS = NamedClasses(
 
 
 def contact_names() -> tuple[str, ...]:
-    """Return the names of all contact models, built-in ones first.
-
-    Raises:
-        InputError: two packages offer the same name.
-    """
+    """Return the names of all contact models, built-in ones first."""
     return CONTACT_MODELS.names()
 
 
 def contact_class(name: str) -> type[ContactModel]:
-    """Return the class of a contact model.
-
-    Raises:
-        InputError: the name is unknown or used twice, or the class cannot be imported.
-    """
+    """Return the class of a contact model."""
     return CONTACT_MODELS.find(name)
 
 
@@ -101,11 +93,7 @@ def contact_model(
 def contact_model_in_mm(
     name: str, resolution_mm: float, options: Mapping[str, Any]
 ) -> ContactModel:
-    """Return the contact model of a scene or command, which states the spacing in mm.
-
-    Raises:
-        InputError: as for `contact_model`, or the options state the resolution again.
-    """
+    """Return the contact model of a scene or command, which states the spacing in mm."""
     if "resolution" in options:
         where = f"contact model '{name}'"
         raise InputError("resolution and resolution_mm are both given", where, "give one of them")
@@ -128,7 +116,6 @@ def _allowed_values(model: type[ContactModel], option: str) -> tuple[Any, ...]:
 
 
 def _check_kind(model: type[ContactModel], option: str, value: Any, where: str) -> None:
-    """Raise an InputError for a value of a wrong type or out of the option's range."""
     from pydantic import TypeAdapter, ValidationError
 
     low, high = OPTION_RANGES.get(option, (-math.inf, math.inf))

@@ -366,7 +366,6 @@ def _tree(surface: Surface, faces: Index) -> fcl.BVHModel:
 
 @compiled_as_written
 def _within_box(points: Array, pose: Array, low: Array, high: Array) -> tuple[Index, Array]:
-    """Return numbers and new positions of points (n, 3) that a pose moves into a box."""
     inside, places, count = np.empty(len(points), np.int64), np.empty((len(points), 3)), 0
     for i in range(len(points)):
         within = True

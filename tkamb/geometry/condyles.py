@@ -340,7 +340,6 @@ class _SampledCondyle:
         return transform(pose, lowest) + step * np.array([1.0, 0.0, 1.0])
 
     def _low_samples(self, up: Array, height: float) -> Index:
-        """Return the samples of all boxes that extend below a height (m) along `up` (3,)."""
         least = self.centres @ up - self.halves @ np.abs(up)
         # The rounding error of a box is far smaller than the heights at which samples have weight.
         boxes = np.flatnonzero(least < height)

@@ -100,7 +100,6 @@ def _arrays(tree: TriangleTree) -> tuple[Array, Array, Array]:
 
 @compiled_as_written
 def _turned_box(box: Array, rotation: Array, translation: Array, result: Array) -> None:
-    """Write the bounding box (6,) of a box that is rotated and translated."""
     for i in range(3):
         middle, half = translation[i], 0.0
         for j in range(3):

@@ -93,9 +93,6 @@ def find_flat_bottom(surface: Surface, rotation: Array | None = None) -> FlatBot
 
     `surface` is in anatomical axes (x anterior, y superior, z right), m. `rotation` (3, 3) from
     mesh axes to these serves the messages.
-
-    Raises:
-        InputError: there is no flat, none faces -y, or two are about equally large.
     """
     rotation = np.eye(3) if rotation is None else rotation
     flats = find_flats(surface)
@@ -164,9 +161,6 @@ def insert_placement(surface: Surface, rotation: Array | None = None) -> Array:
     of the bottom's bounding rectangle in x and z. The smallest rotation turns a tilted mesh level.
 
     `surface` and `rotation`: see `find_flat_bottom`.
-
-    Raises:
-        InputError: see `find_flat_bottom`.
     """
     flat = find_flat_bottom(surface, rotation)
     level = _levelling(flat.normal)

@@ -58,10 +58,6 @@ def inside_intervals(surface: Surface, axis: int, first: Array, second: Array) -
     Args:
         first: (a,) increasing coordinates (m) of the lines along axis + 1 (cyclic).
         second: (b,) the same along axis + 2.
-
-    Raises:
-        InputError: more than 1 % of the lines cross the surface an odd number of times, or such a
-            line cannot be repaired from its neighbours.
     """
     line, height, rising, sides = _crossings(surface, axis, first, second)
     shape = (len(first), len(second))

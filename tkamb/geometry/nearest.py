@@ -251,7 +251,6 @@ def _apart(box: Array, point: Array) -> float:
 
 @compiled_as_written
 def _on_edge(along: float, length: float) -> float:
-    """Return the position of the nearest point on an edge, from 0 to 1."""
     return min(max(along / length, 0.0), 1.0) if length > 0.0 else 0.0
 
 

@@ -38,9 +38,6 @@ def convex_outline(points: Array, offset: float = 0.0, step_deg: float = 2.0) ->
 
     The corners of the enlarged hull lie on circles about the hull's corners, `step_deg` apart. With
     2 deg the hull is too small by at most 0.015 % of the offset.
-
-    Raises:
-        InputError: the points span no area.
     """
     try:
         hull = points[ConvexHull(points).vertices]
@@ -70,9 +67,6 @@ def sagittal_outline(
 
     Returns:
         Strictly convex polygon, counter-clockwise, x-y, m.
-
-    Raises:
-        InputError: no plane meets a surface, or the sections span no area.
     """
     return _outline(tuple(surfaces), tuple(float(z) for z in z_values), offset, below)
 

@@ -125,9 +125,6 @@ def divide_insert(insert: Surface) -> tuple[Surface, Surface]:
     A horizontal plane just above the surroundings separates them. In front the post is cut at a
     plane x = const, the fixed bottom of the cam-post contact; the material in front of it is
     removed.
-
-    Raises:
-        InputError: there is no post, or it cannot be divided.
     """
     post, where = find_post(insert), "[contact] post"
     if post is None:
@@ -197,9 +194,6 @@ def closed_by_fans(vertices: Array, faces: Index, name: str) -> tuple[Array, Ind
     """Return vertices and faces of the surface; a fan of triangles closes every hole.
 
     The holes are plane; `name` of the part is for a message.
-
-    Raises:
-        InputError: a fan about a hole's centre would overlap itself.
     """
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     key, back = (edges * [len(vertices), 1]).sum(1), (edges * [1, len(vertices)]).sum(1)

@@ -173,7 +173,6 @@ class RayCaster:
 
 
 def _rays(origins: ArrayLike, directions: ArrayLike) -> tuple[Array, Array]:
-    """Return origins (n, 3) and directions (n, 3), or one direction (1, 3) of all rays."""
     rays = rows(origins), rows(directions)
     if len(rays[1]) not in (1, len(rays[0])):
         raise ValueError(f"{len(rays[1])} directions for {len(rays[0])} rays")

@@ -370,7 +370,6 @@ def _joined_along_rims(vertices: Array, faces: Index) -> Index:
 
 
 def _divided(vertices: Array, faces: Index, dividing: dict[tuple[int, int], Index]) -> Index:
-    """Return the triangles after insertion of vertices, in order, into directed edges."""
     by_face: dict[int, list[int]] = defaultdict(list)
     starts = {start for start, _ in dividing}
     for face in np.flatnonzero(np.isin(faces, list(starts)).any(axis=1)):

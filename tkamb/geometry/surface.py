@@ -343,7 +343,6 @@ def corner_angles(surface: Surface) -> Array:
 
 
 def _mean_normals(weights: Array, normals: Array) -> Array:
-    """Return unit means (n, 3) of three normals (n, 3, 3) with barycentric weights (n, 3)."""
     return _unit(np.einsum("ij,ijk->ik", weights, normals))
 
 

@@ -90,11 +90,7 @@ class Anatomy:
         return [self.model.joints[joint] for joint in path]
 
     def frame(self, name: str) -> FixedFrame:
-        """Return the frame of a part of the knee, or of a name in the model.
-
-        Raises:
-            InputError: the frame does not exist.
-        """
+        """Return the frame of a part of the knee, or of a name in the model."""
         names = {
             "femur": self.femur,
             "tibia": self.tibia,
@@ -122,9 +118,6 @@ def find_anatomy(
         joints: expected names of the knee's joints; empty: no check.
         plane: pose of the patella's sagittal plane in the frame "femur"; None: the default of
             `tkamb.knee.parts.Extensor`.
-
-    Raises:
-        InputError: an unknown part, frame or joint; tibia and femur fixed to each other.
     """
     for part in names:
         if part not in PARTS:

@@ -187,27 +187,18 @@ class Bridge:
             self._shank = tuple(anatomy.model.subtrees[anatomy.knee_joints[0]])
 
     def link_point(self, point: LinkPoint) -> LinkPoint:
-        """Return a point on a frame of the user's model as a point on a link of the chain.
-
-        Raises:
-            InputError: the frame is fixed to neither tibia, femur nor patella.
-        """
+        """Return a point on a frame of the user's model as a point on a link of the chain."""
         link, in_link = self._on_link(point.link)
         local = in_link.act(np.asarray(point.position, float))
         return LinkPoint(link, MIRROR @ local if self.left else np.array(local))
 
     def wrap_object(self, wrap: "WrapObject") -> "WrapObject":
-        """Return a wrap object on a frame of the user's model as one on a link of the chain.
-
-        Raises:
-            InputError: the frame is fixed to neither tibia, femur nor patella.
-        """
+        """Return a wrap object on a frame of the user's model as one on a link of the chain."""
         link, in_link = self._on_link(wrap.body)
         moved = wrap.on(link, in_link.homogeneous)
         return moved.mirrored() if self.left else moved
 
     def _on_link(self, name: str) -> tuple[str, pin.SE3]:
-        """Return the link that a frame of the user's model is fixed to, and its pose in it."""
         anatomy = self.anatomy
         links = [("tibia", anatomy.tibia), ("femur", self.component)]
         if anatomy.patella is not None:
@@ -346,9 +337,6 @@ class Bridge:
 
         Newton's method finds the coordinates of the joints between tibia and femur. `target` is
         pose_femoral_in_insert of a right knee.
-
-        Raises:
-            InputError: these joints cannot produce that pose.
         """
         model = self.anatomy.model
         data, placement = model.createData(), self._placed(target)

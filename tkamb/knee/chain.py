@@ -116,11 +116,7 @@ class Chain:
         self._tibia_in_root = model.frames[self.frame_id("tibia")].placement.homogeneous
 
     def frame_id(self, link: str) -> int:
-        """Return Pinocchio's id of a link's frame.
-
-        Raises:
-            InputError: the link does not exist.
-        """
+        """Return Pinocchio's id of a link's frame."""
         if link not in self._frames:
             names = [f.name for f in self.model.frames if f.type == pin.FrameType.BODY]
             raise InputError(f"no link '{link}' in the URDF", None, names_near(link, names))

@@ -108,11 +108,7 @@ class KneeContact:
         return contact if tangent is None else tangent(contact)
 
     def check_differentiable(self) -> None:
-        """Raise an error unless the model's forces have derivatives.
-
-        Raises:
-            InputError: they jump from facet to facet.
-        """
+        """Raise an error unless the model's forces have derivatives."""
         if not self.model.differentiable:
             raise InputError(
                 f"the forces of contact model '{self.model.name}' jump from facet to facet",

@@ -7,17 +7,15 @@ line from the pelvis acts on the femur, and the hip loads balance it.
 
 With fixed contact points and lines the equations are linear in all loads. This has two uses.
 
-1. The tension of the extensor group is Q = Q_0 + sum_i g_i F_i + h r, with Q_0 without the other
-   muscles, their forces F_i, and a moment r on the tibia about the insert's z. Solved for r, this
-   is the knee's row of a static optimisation (`flexion_row`),
+1. The tension Q of the extensor group is linear in the forces F_i of the other muscles and in a
+   moment r on the tibia about the insert's z (docs/muscles.md). Solved for r, this is the knee's
+   row of a static optimisation (`flexion_row`),
 
        -Q_0/h = -(1/h) Q + sum_i (g_i/h) F_i + r.
 
    It includes contact, ligaments, patella and friction. -1/h is the moment arm of the extensor
    group, and -Q_0/h the moment that all muscles together supply. If coordinates are released,
-   contact points and the medial-lateral split depend on the muscles. The row then comes from the
-   tension of the patellar ligament, linear in the muscle forces by the tangent of contact and
-   ligaments (`ReleasedForces.tension_per_wrench`, `yielding_flexion_row`).
+   the row comes from the tension of the patellar ligament (`yielding_flexion_row`).
 
 2. A normal force is the sum of the contributions of all loads (`condyle_contributions`),
 

@@ -55,9 +55,6 @@ class ExtensorLines:
 
     `mechanism` is the input of the search for the patella. Objects with the same surfaces share the
     `prepared` patellofemoral contact.
-
-    Raises:
-        InputError: a line starts inside the bone that it wraps.
     """
 
     def __init__(self, parts: ExtensorParts) -> None:
@@ -235,9 +232,6 @@ class ExtensorFrames:
 
     Attributes:
         states: the patella at each frame; a recorded patella is evaluated at first use.
-
-    Raises:
-        InputError: the patella is found in fewer than two frames.
     """
 
     def __init__(
@@ -440,7 +434,6 @@ class _RecordedStates(Sequence[PatellaState]):
         self._cache = dict(lost or {})
 
     def ligament_length(self, k: int) -> float:
-        """Return the length of the ligament's path in frame k, m."""
         frame = PatellaFrame(self._mechanism, self.poses[k])
         coordinates, contact = self._contacts.coordinates[k], self._contacts[k]
         return float(frame.balance_at(coordinates, contact).ligament.length)

@@ -104,7 +104,6 @@ class _Planes:
 
     @classmethod
     def through(cls, p: Array, q: Array) -> "_Planes":
-        """Return half planes at equal angles through the lines from p to q (f, 3)."""
         along = unit(q - p)
         middle = p - dot(p, along)[:, None] * along
         offset = np.linalg.norm(middle, axis=1)
@@ -329,7 +328,6 @@ class _Shot:
         return residual, jacobian, entry, leave, reach[:, 0] * dot(outgoing, direction)
 
     def _turn(self, velocity: Array, normal: Array, slope: Array) -> Array:
-        """Return the rates (f, 3) of the unit normals at points with velocities (f, 3)."""
         gradient_rate = velocity / self.axes**2
         return (gradient_rate - dot(gradient_rate, normal)[:, None] * normal) / slope[:, None]
 

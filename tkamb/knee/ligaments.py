@@ -272,10 +272,6 @@ def build_ligaments(
     A missing slack length follows from the reference strain eps_r and the length L_r in the frame
     nearest to the reference flexion: L0 = L_r/(1 + eps_r). `poses` (f, 4, 4) are in the insert
     frame, `flexion` (f,) in rad.
-
-    Raises:
-        InputError: a link is unknown, both ends are the same point, or no recorded frame is near
-            the reference flexion.
     """
     flexion = np.asarray(flexion, float)
     return tuple(_with_slack_length(bundle, poses, flexion) for bundle in ligaments)
@@ -373,9 +369,6 @@ def check_collateral_sides(ligaments: Iterable[Ligament], chain: Chain, side: st
 
     The bundles are those of a right knee or of a mirrored left one: z points laterally. `side` is
     that of the patient's knee, for the message.
-
-    Raises:
-        InputError: an end lies on the wrong side.
     """
     for bundle in ligaments:
         sign = _lateral_sign(bundle.name)

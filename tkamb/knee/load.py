@@ -78,11 +78,7 @@ def total_wrench(loads: Sequence[PointForces], point: Array) -> Array:
 
 
 def link_point(point: Point) -> LinkPoint:
-    """Return a point on a frame as a `LinkPoint`.
-
-    Raises:
-        InputError: the point is no pair of a frame's name and three finite numbers.
-    """
+    """Return a point on a frame as a `LinkPoint`."""
     link: object = None
     position: object = ()
     if isinstance(point, LinkPoint):

@@ -168,11 +168,7 @@ class Line:
 
 
 def off_femur(points: Sequence[LinkPoint], chain: "Chain") -> int:
-    """Return the number of the segment of a line that leaves the femur.
-
-    Raises:
-        InputError: no segment leaves the femur.
-    """
+    """Return the number of the segment of a line that leaves the femur."""
     carriers = [chain.carrier(point.link) for point in points]
     for i, (one, other) in enumerate(pairwise(carriers)):
         if one == "femur" != other:
@@ -201,9 +197,6 @@ def check_muscles(muscles: Sequence[Muscle], chain: "Chain") -> None:
     """Raise an error unless there is one muscle, from the femur to the patella.
 
     Equilibrium does not determine how several muscles share the joint moments.
-
-    Raises:
-        InputError: there are several muscles, or the muscle crosses no joint or inserts elsewhere.
     """
     for muscle in muscles:
         if len({chain.carrier(point.link) for point in muscle.points}) == 1:
@@ -306,11 +299,7 @@ class TensionLine:
 
 
 def tension_lines(muscles: Iterable[Muscle], anatomy: Anatomy) -> dict[str, TensionLine]:
-    """Return name of a muscle -> its line.
-
-    Raises:
-        InputError: a muscle has fewer than two points or a wrap, or names an unknown frame.
-    """
+    """Return name of a muscle -> its line."""
     lines = {}
     for muscle in muscles:
         where = f"muscle {muscle.name}"
@@ -336,9 +325,6 @@ def checked_tensions(
         tensions: muscle -> tension, N; or the tension of the quadriceps alone, N.
         extensor: names of the lines of the extensor mechanism, the quadriceps first.
         lines: names of the other muscles.
-
-    Raises:
-        InputError: a muscle is unknown, or a tension is negative or not finite.
     """
     if tensions is None:
         return {}

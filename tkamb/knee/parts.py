@@ -166,7 +166,6 @@ def as_surface(mesh: Mesh, name: str, closed: bool = False) -> Surface:
 
 
 def _arrays(mesh: Mesh, name: str) -> tuple[Array, Any]:
-    """Return vertices (n, 3) and triangles (k, 3) of a mesh object or a pair of arrays."""
     hint = "give a trimesh.Trimesh, or vertices (n, 3) in metres and triangles (k, 3)"
     parts = (mesh.vertices, mesh.faces) if hasattr(mesh, "faces") else mesh
     try:
@@ -198,11 +197,7 @@ class Surfaces:
 def surfaces_of(
     implant: Implant, is_left: bool, with_contact: bool, with_extensor: bool
 ) -> Surfaces:
-    """Return the surfaces of an implant, with the insert in the frame "insert".
-
-    Raises:
-        InputError: a required mesh is missing or cannot be used.
-    """
+    """Return the surfaces of an implant, with the insert in the frame "insert"."""
     needs = {"femoral": with_contact or with_extensor}
     needs |= {"insert": with_contact, "patella": with_extensor}
     surfaces: list[Surface | None] = []
@@ -238,11 +233,7 @@ def placed_insert(
 
 
 def bundle_on_chain(bridge: Bridge, bundle: "Ligament") -> "Ligament":
-    """Return a bundle with its ends and surfaces on links of the chain.
-
-    Raises:
-        InputError: the slack length is missing, or an end is on a frame outside the knee.
-    """
+    """Return a bundle with its ends and surfaces on links of the chain."""
     ends = [bridge.link_point(link_point(end)) for end in (bundle.proximal, bundle.distal)]
     where = f"ligament {bundle.name}"
     slack = real_number(
@@ -273,11 +264,7 @@ def crossing_and_others(
 
 
 def extensor_lines(bridge: Bridge, extensor: Extensor, surfaces: Surfaces) -> "ExtensorLines":
-    """Return the lines of an extensor mechanism on the chain.
-
-    Raises:
-        InputError: a line does not fit the knee.
-    """
+    """Return the lines of an extensor mechanism on the chain."""
     from tkamb.knee.extensor import ExtensorLines, ExtensorParts
     from tkamb.knee.muscles import check_muscles
 
@@ -323,11 +310,7 @@ def prepared_contact(
 def prepared_button(
     contact: "ContactModel | str", implant: Implant, surfaces: Surfaces, chain: Chain, cache: bool
 ) -> "Button":
-    """Return a contact model that is prepared for the button and the femoral component.
-
-    Raises:
-        InputError: the button is not closed, or has no flat back.
-    """
+    """Return a contact model that is prepared for the button and the femoral component."""
     from tkamb.contact.pair import ContactPair
     from tkamb.knee.button import Button, button_in_patella, without_pegs
 
@@ -342,11 +325,7 @@ def prepared_button(
 
 
 def as_model(contact: "ContactModel | str", where: str, cache: bool = True) -> "ContactModel":
-    """Return a contact model, from its name if need be; a lattice without its cache if not `cache`.
-
-    Raises:
-        InputError: it is no contact model.
-    """
+    """Return a contact model, from its name if need be; `cache` False: a lattice without one."""
     from tkamb.contact.model import ContactModel
     from tkamb.contact.registry import contact_model
 

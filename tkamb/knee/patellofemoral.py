@@ -110,9 +110,6 @@ class PatellofemoralContact:
         ml: z of the patella's frame in the joint's frame, m.
         lateral_yield: c of the module's equations, m.
         tilt_yield: d of the module's equations, rad/m.
-
-    Raises:
-        InputError: the button does not lie on both sides of the sagittal plane.
     """
 
     def __init__(

@@ -170,9 +170,6 @@ def press_all(
     """Return the presses at q (n, nq) under one load or a load per pose (n,), N.
 
     The warm start of each press is the press before it.
-
-    Raises:
-        InputError: the number of loads is neither one nor n.
     """
     count = len(q)
     if np.shape(load) not in ((), (count,)):
@@ -197,7 +194,6 @@ def press_all(
 
 
 def _of_condyles(results: list[KneeContactResult], name: str) -> Array:
-    """Return a value (n, 2) of the condyles."""
     values = np.zeros((len(results), len(SIDES)))
     for k, result in enumerate(results):
         for i, side in enumerate(SIDES):
@@ -210,11 +206,7 @@ def _of_condyles(results: list[KneeContactResult], name: str) -> Array:
 
 
 def forces_of_all(knee: "Knee", q: Array, v: Array, tensions: Any, data: "KneeData") -> Array:
-    """Return the forces (n, njoints, 6) of `Knee.external_forces` at q (n, nq) and v (n, nv).
-
-    Raises:
-        InputError: there are not as many velocities as configurations.
-    """
+    """Return the forces (n, njoints, 6) of `Knee.external_forces` at q (n, nq) and v (n, nv)."""
     if np.shape(v) != (len(q), knee.model.nv):
         raise InputError(
             f"the shape is {np.shape(v)}", "v", f"give ({len(q)}, {knee.model.nv}), one per q"

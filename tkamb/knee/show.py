@@ -85,7 +85,6 @@ def show_knee(
     femur = kinematics.pose if contact is None else contact.pose
 
     def in_world(points: Array) -> Array:
-        """Return points (n, 3) in the world, from the insert frame of a right knee."""
         return transform(world, points @ MIRROR if knee.left else points)
 
     to_side = mirrored_pose if knee.left else np.asarray
@@ -176,7 +175,6 @@ def _solid(
 
 
 def _strand(node: Any, points: Array, colour: int, radius: float = STRAND_RADIUS) -> None:
-    """Draw a polyline (n, 3) in the world frame as cylinders."""
     for k, (start, end) in enumerate(pairwise(points)):
         along = end - start
         length = float(np.linalg.norm(along))
@@ -195,7 +193,6 @@ def _strand(node: Any, points: Array, colour: int, radius: float = STRAND_RADIUS
 def _map(
     node: Any, contact: "ContactResult", triangles: Array, in_world: Any, peak: float | None
 ) -> None:
-    """Draw the pressure on the loaded triangles of the map, just above the insert."""
     loaded = triangles[(contact.pressure[triangles] > 0.0).any(axis=1)]
     if not len(loaded):
         return

@@ -101,7 +101,6 @@ class InitialPoses:
         starts: list[Array],
         points: dict[str, Array],
     ) -> str:
-        """Return a description of a second equilibrium from other guesses; empty: not found."""
         for guess in starts:
             if not np.isfinite(guess).all():
                 continue

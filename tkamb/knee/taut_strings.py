@@ -91,7 +91,6 @@ def _polar(points: Array) -> tuple[Array, Array]:
 
 
 def _wrapped(angles: Array) -> Array:
-    """Return angles shifted into ±pi."""
     return np.asarray(angles - 2.0 * np.pi * np.round(angles / (2.0 * np.pi)))
 
 
@@ -353,8 +352,6 @@ def _leap(value: Array, last_value: Array, residual: Array, last_residual: Array
 
 
 class _Strings:
-    """State of the iteration in `strings_over`, with the same arguments."""
-
     def __init__(
         self, wraps: Sequence[WrapObject], poses: Array, start: Array, end: Array, moves: Mask
     ) -> None:
@@ -369,7 +366,6 @@ class _Strings:
         return WrappedStrings(self.order, self.entry, self.exit, self.arc, self.push)
 
     def places(self) -> Array:
-        """Return the touching points of each string in one row, m, (f, 6w)."""
         return np.concatenate([self.entry, self.exit], axis=2).reshape(len(self.start), -1)
 
     def place(self, places: Array) -> None:

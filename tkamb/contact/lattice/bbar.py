@@ -32,9 +32,6 @@ class BbarHexahedra(Solid):
 
     At each point e² = (2/3) dev eps : dev eps and 3 mu_s = q(e)/e. The bulk is elastic.
     `Solid` has the arguments, `ShearCurve` q.
-
-    Raises:
-        InputError: the Jacobian is not positive at a Gauss point.
     """
 
     def __init__(self, nodes: Array, cells: Index, spacing: Array, material: Material) -> None:

@@ -268,7 +268,6 @@ def _step(
     load: float | None,
     active: Mask,
 ) -> tuple[Array, ContactForces]:
-    """Return the displacement (n, 3), m, and the contact forces of one full Newton step."""
     solid = problem.solid
     operator = prepare_operator(solid.tangent(u), problem.index, problem.held, nodes)
     without_contact = u - operator.solve(solid.forces(u)[0])

@@ -6,10 +6,7 @@ brings them onto the femoral component, and slide freely in x and z. All other n
 Linear: a unit displacement of the nodes in contact gives the slope of the reaction F. One
 correction of the approach D then gives the load, if the contact set does not change. Nonlinear: at
 fixed D, Newton steps with the tangent springs bring the free nodes to equilibrium. Then D_new = D
-(load/F)^(1/m). Sharma (2008) has m = 1, which oscillates without end if F grows with D² or faster,
-as it does while nodes come into contact. tkamb takes the exponent of this growth between the last
-two D as m. It also releases nodes in tension, which Sharma (2008) does not define, and adds
-penetrated ones.
+(load/F)^(1/m), see docs/lattice.md. Penetrated nodes are added, nodes in tension released.
 
 No step factorises a matrix, although the free unknowns change with the contact set. `prepare`
 stores the factor of the undeformed insert, K = L Lᵀ, and the response of the held unknowns, Z = L⁻¹
@@ -331,7 +328,6 @@ def _next_depth(
 def _next_active(
     positions: Array, planes: TangentPlanes, active: Mask, force: Array, depth: float
 ) -> Mask:
-    """Return the active set without nodes in tension and with the penetrated nodes."""
     return (active & (force >= 0)) | (~active & (planes.gap(positions) < depth))
 
 
@@ -375,7 +371,6 @@ def _press(
 
 
 def _balance(solid: SourceNetwork, u: Array, active_nodes: HeldNodes) -> tuple[Array, float, Array]:
-    """Return the forces on the active nodes, the relative residual and the internal forces."""
     internal = solid.internal_force(u)
     force = -internal.ravel()[active_nodes.unknowns]
     size = max(float(np.abs(force).sum()), 1e-300)

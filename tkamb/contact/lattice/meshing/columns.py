@@ -319,7 +319,6 @@ def _without_narrow_gaps(
 
 
 def _admit(field: NodeField, intervals: Intervals, ends: Ends) -> None:
-    """Mark the nodes of every interval as members, and move its end nodes onto the surface."""
     i, k = intervals.second, intervals.first
     count = ends.last - ends.first + 1
     owner = np.repeat(np.arange(len(count)), count)

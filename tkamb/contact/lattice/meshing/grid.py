@@ -82,7 +82,6 @@ class MissingPart:
     centre: tuple[float, ...]
 
     def __str__(self) -> str:
-        """Return the size and the place in words."""
         size = " x ".join(f"{value / MILLIMETRE:.3g}" for value in self.extents)
         where = ", ".join(f"{value / MILLIMETRE:.1f}" for value in self.centre)
         return f"a part of {size} mm at ({where}) mm of the insert frame"
@@ -322,7 +321,6 @@ def grid_spacing(extent: Array, target_size: float) -> Array:
 
 
 def _sound_cells(field: NodeField, insert: Surface) -> tuple[Index, int]:
-    """Return the usable cells (c, 8) of the flattened grid, and the number of omitted cells."""
     shape = field.member.shape
     corner = np.argwhere(_all_corners(field.member))
     grid = corner[:, None, :] + CORNERS
@@ -384,7 +382,6 @@ def _classes(field: NodeField, cells: Index) -> NDArray[np.int8]:
 
 
 def _on_bottom(field: NodeField) -> Mask:
-    """Return the mask, over the flattened grid, of nodes in the flat bottom."""
     height = field.points[..., 1].ravel()
     flat = np.abs(height) <= max(BOTTOM_TOLERANCE, 0.02 * field.spacing[1])
     return field.lower_end.ravel() & flat

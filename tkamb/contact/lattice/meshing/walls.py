@@ -186,7 +186,6 @@ def _firing_points(field: NodeField) -> Array:
 
 
 def _filled_cells(field: NodeField, surface: Surface) -> Mask:
-    """Return the mask of cells that have eight members and their centre in the part."""
     member, y = field.member, field.points[..., 1]
     complete = np.ones(tuple(n - 1 for n in member.shape), bool)
     centre = np.zeros(complete.shape)
@@ -236,7 +235,6 @@ def _walls_beside(
 
 
 def _move_out(field: NodeField, firing: Array, hits: list[WallHits], rays: RayCaster) -> None:
-    """Move members onto walls within half a cell."""
     move = np.zeros((*field.member.shape, 2))
     for column, axis in ((0, 0), (1, 2)):
         forward, backward = hits[axis : axis + 2]
