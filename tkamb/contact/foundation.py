@@ -101,10 +101,6 @@ class ElasticFoundation(ContactModel):
     The approach counts from the first touch of the triangles; the smooth surface lies outside them
     by up to their sagitta.
 
-    Args:
-        resolution: m, spacing of the map points.
-        law: "nonlinear" or "linear".
-
     References:
         Blankevoort, Kuiper, Huiskes & Grootenboer, J Biomech 24:1019 (1991),
         doi:10.1016/0021-9290(91)90019-J; Bei & Fregly, Med Eng Phys 26:777 (2004),

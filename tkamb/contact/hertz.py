@@ -120,12 +120,11 @@ class CondyleGeometry:
 class Hertz(ContactModel):
     """Elliptical Hertz contact of each condyle.
 
-    The contact point of each condyle is its first touch along -y; quadrics fitted there give the
-    normal and the relative curvatures (`osculate`). Hertz's solution then gives F = c delta^1.5
-    (`contact_ellipse`), with E* = E/(1 - nu²) of the insert; E is the slope of the material's curve
-    at the origin. The delta of a condyle is its travel beyond first touch times n_y: both move down
-    together, so the tilt decides how they share the load. Contact point and curvatures remain those
-    of first touch.
+    The contact point of each condyle is its first touch along -y, with the normal and the relative
+    curvatures of quadrics fitted there (`osculate`). Then F = c delta^1.5 (`contact_ellipse`), with
+    E* = E/(1 - nu²) of the insert; E is the slope of the material's curve at the origin. The delta
+    of a condyle is its travel beyond first touch times n_y: both move down together, so the tilt
+    decides how they share the load.
 
     The map contains the semi-ellipsoid of pressure, averaged over each grid cell and scaled so that
     its vertical force is exact. Area and peak of a condyle are those of the ellipse: pi a b and p0.
@@ -135,7 +134,6 @@ class Hertz(ContactModel):
     thickness: the half-space is then too soft. A mobile bearing is pressed like a fixed one.
 
     Args:
-        resolution: m, spacing of the map points.
         patch_radius: m, radius of the discs on which curvatures are fitted. With 4 mm the force on
             a sphere of 20 mm is 0.5 % too small. On a real implant (relative radii 70 and 240 mm)
             area and peak differ by 8 % between 4 and 6 mm; below 3 mm facets dominate.

@@ -12,10 +12,9 @@ the angle between the ends. The arc θ and the length S are
 
 A cylinder is unrolled: L = √(S² + Δz²), with z linear in S.
 
-A path point P of another body may move into an ellipsoid. In OpenSim the string then ignores it at
-once, and its length jumps by up to 14 mm. In tkamb the ellipsoid shrinks with the point by the
-factor k = |P/a|, so that the length is continuous. L is homogeneous of degree one in P, Q and k, so
-that
+A path point P of another body may move into an ellipsoid. OpenSim then ignores it
+(docs/opensim.md); here the ellipsoid shrinks with the point by the factor k = |P/a|, so that the
+length is continuous. L is homogeneous of degree one in P, Q and k, so that
 
     ∂L/∂k = (L + P·u_P - Q·u_Q) / k,
 
@@ -187,7 +186,7 @@ def _section(start: Array, end: Array, outline: Array) -> WrapTouch:
 
 
 def inside(wrap: WrapObject, points: Array) -> Mask:
-    """Return whether strings ignore the object because of points (f, 3), m, inside, in its frame.
+    """Return whether points (f, 3), m, in the object's frame lie where strings ignore the object.
 
     No string ignores an ellipsoid, because it shrinks, or a torus.
     """
@@ -285,9 +284,8 @@ class WrappedStrings:
     """f strings over w objects.
 
     Args:
-        order: indices of the objects that a string touches, from start to end, then -1, (f,
-            w).
-        entry: points where the strings meet the objects, m, (f, w, 3); `exit`: leave.
+        order: indices of the objects that a string touches, from start to end, then -1, (f, w).
+        entry: points where the strings meet the objects, m, (f, w, 3); they leave at `exit`.
         arc_m: lengths on the objects, m, (f, w); NaN if the iteration has not converged.
         push: force of a shrinking object on start and end, per unit tension, (f, w, 2, 3).
     """

@@ -7,34 +7,29 @@ approach D with
     gamma lambda = 0, gamma >= 0,  gamma = n · (x - p) + D n_y, the gap of a node at x
     -sum of lambda n_y = load
 
-f_int are the internal forces of the displaced solid under its nonlinear law. p are the femoral
-points. One pass is a modified Newton step with the factorised linear stiffness K:
-
-1. Femoral points and normals: vertical rays through the displaced nodes.
-2. Contact: a primal-dual active set on the compliance of the candidate nodes (`active_set.py`).
-   Gaps include the displacement K⁻¹ h. The nonlinear loads h are those of step 4 of the last pass;
-   at equilibrium h = K u - f_int(u).
-3. Displacement: K u = f + h. Residual: r = f - f_int(u) (`nonlinear_balance.py`).
-4. Next loads: h + s r, accelerated by Anderson's method. The softening s is the ratio of secant
-   and tangent stiffness along u, so that K/s approximates the tangent stiffness.
+f_int are the internal forces of the displaced solid under its nonlinear law, p the femoral points.
+A pass is a modified Newton step with the factorised linear stiffness K; docs/lattice.md ("Solver")
+has its steps: rays, active set (`active_set.py`), displacement K u = f + h, residual r = f -
+f_int(u) and next loads h + s r (`nonlinear_balance.py`). At equilibrium the nonlinear loads h are K
+u - f_int(u). The softening s is the ratio of secant and tangent stiffness along u.
 
 Passes evaluate only the region of the softened elements. When the residual there is within the
-tolerances, the whole solid is measured: r from the law of every element, without the factorised K,
-and the gap with new rays at the displaced nodes. The iteration has converged when
+tolerances, the whole solid is measured: r from the law of every element, without K, and the gap
+with new rays at the displaced nodes. The iteration has converged when
 
     |r| / |f| <= force_tolerance
     s |r · u| / (f · u) <= work_tolerance,    s = (f_int(u) · u) / (uᵀ K_T u)
     |gamma| / max |u| <= gap_tolerance        for active nodes, and for penetrations of others
     max(|f_i| + |r_i|) / max |f_i| - 1 <= peak_tolerance
 
-and the active set has stopped changing. The result reports these residuals. The second residual
-estimates the relative error of the approach, because an error du = e u leaves r = e K_T u. The load
-and lambda >= 0 hold to rounding in every pass.
+and the active set has stopped changing. The second residual estimates the relative error of the
+approach, because an error du = e u leaves r = e K_T u. The load and lambda >= 0 hold to rounding in
+every pass.
 
 After `max_passes` an iteration that began with the loads of an earlier solution begins again
-without them. `solve_by_newton` continues if this fails, too. This full Newton iteration is also the
-reference: every step factorises the tangent stiffness and solves the contact on its compliance. The
-two share only the contact conditions.
+without them; else `solve_by_newton` continues. This full Newton iteration is also the reference:
+every step factorises the tangent stiffness and solves the contact on its compliance. The two share
+only the contact conditions.
 """
 
 from dataclasses import dataclass, replace

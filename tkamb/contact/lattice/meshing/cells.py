@@ -188,7 +188,7 @@ def mean_gradient(corners: Array) -> tuple[Array, Array]:
     """Return the volume-averaged gradients g_i (s, 8, 3), 1/m, and the volume (s,), m³.
 
     A linear field has its exact gradient: sum_i x_i g_i = identity (Flanagan & Belytschko, Int J
-        Numer Meth Eng 17:679, 1981). The Jacobian's cofactors also suit inverted cells.
+    Numer Meth Eng 17:679, 1981). The Jacobian's cofactors also suit inverted cells.
     """
     gradients, volume = np.zeros((len(corners), 8, 3)), np.zeros(len(corners))
     j, cofactor = np.empty((3, 3)), np.empty((3, 3))
