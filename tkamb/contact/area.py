@@ -103,8 +103,7 @@ def area_above(points: Array, triangles: Index, pressure: Array, level: float) -
     / 24, with the gradient g of q at a corner. For a Hertzian pressure, where q is quadratic, the
     mean of q is exact. The area is continuous in the pressures.
 
-    Args:
-        Points (n, 3), m, and pressure (n,), Pa, are those of the nodes; level: Pa, positive.
+    Points (n, 3), m, and pressure (n,), Pa, are those of the nodes. `level`, Pa, is positive.
     """
     # p² is interpolated, because it is linear at the rim of a Hertzian contact while p has a
     # vertical slope there.

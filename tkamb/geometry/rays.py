@@ -142,8 +142,7 @@ class RayCaster:
 
         A crossing at an edge or a vertex appears once if its triangles face in the same direction.
 
-        Args:
-            Arguments as in `first`.
+        Arguments as in `first`.
 
         Returns:
             ray (m,), distance (m,), m, and face (m,), sorted by ray, then by distance.

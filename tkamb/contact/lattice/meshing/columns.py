@@ -188,7 +188,8 @@ class NodeField:
         lines: x and z coordinates of the grid lines along y, m.
         points: (nx, ny, nz, 3), m.
         member: the nodes that belong to the part.
-        lower_end, upper_end: ends of intervals; top: upper ends of the highest ones.
+        lower_end: the lower ends of intervals, as `upper_end` the upper ones.
+        top: the upper ends of the highest intervals.
         interval: number of each node's interval; -1 if there is none.
         mended: number of lines with crossings corrected from their neighbours.
         closed_gaps: number of filled gaps, narrower than a cell.

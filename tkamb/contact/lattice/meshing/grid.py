@@ -75,7 +75,7 @@ def standing_pieces(cells: Index, bottom: Mask) -> Mask:
 
 @dataclass(frozen=True)
 class MissingPart:
-    """The largest part of a mesh that its lattice lacks, insert frame."""
+    """The largest part of a mesh that its lattice lacks: m³, m, insert frame."""
 
     volume: float
     extents: tuple[float, ...]
