@@ -94,7 +94,7 @@ class PostPair(ContactPair):
 
 @dataclass(frozen=True, eq=False)
 class PostContact:
-    """Contact of cam and post at one pose, insert frame. Without contact the force is zero.
+    """Contact of cam and post at one pose, insert frame, SI. Without contact the force is zero.
 
     Args:
         load: wrench of the normal forces on the insert; None without contact.

@@ -42,7 +42,7 @@ class ContactStatus(Enum):
 
 @dataclass(frozen=True, eq=False)
 class CondyleContact:
-    """The contact of one condyle.
+    """The contact of one condyle, SI.
 
     Args:
         force: N, magnitude of the summed normal forces on the insert.
@@ -83,6 +83,9 @@ class ContactResult:
         places: (n, 3) m, where the nodal forces act: the map points, or the points of the femoral
             component that the columns of a foundation meet.
         wrench_on_insert: (6,) force (N) and moment about the insert origin (N·m).
+        medial: contact of the medial (or only) condyle; None if unloaded, like `lateral`.
+        residual: relative residual of the model's solver.
+        flags: warnings in words.
     """
 
     pair: ContactPair

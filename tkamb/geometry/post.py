@@ -57,13 +57,14 @@ measured in this ring, which lies beyond the slanted sides of the post."""
 
 @dataclass(frozen=True)
 class Post:
-    """Position and size of a post, insert frame.
+    """Position and size of a post, insert frame, SI.
 
     Args:
         x: m, of the centre, like `z`.
         height: m, height of the tip above the lowest dish.
         foot: m, y of the plane at which the post is cut off.
         front: m, x of the anterior face, at three quarters of the height above the foot.
+        half_width: m, along z; `area` is that in the plan view.
     """
 
     x: float

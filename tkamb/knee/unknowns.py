@@ -57,7 +57,7 @@ CONTACT_POINT = ContactPointSettings()
 
 @dataclass(frozen=True, eq=False)
 class CondylePoint:
-    """The contact point of one condyle on the insert, insert frame.
+    """The contact point of one condyle on the insert, insert frame, m.
 
     Args:
         normal: unit normal from the insert to the femur, (3,).

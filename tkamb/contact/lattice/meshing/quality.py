@@ -94,7 +94,7 @@ def _volume_refusal(
 
 @dataclass(frozen=True)
 class LatticeQuality:
-    """Measures of a lattice.
+    """Measures of a lattice, SI.
 
     Args:
         edge_ratio: longest over shortest edge of a cell: median, 95th percentile, largest.
