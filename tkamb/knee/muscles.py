@@ -337,7 +337,9 @@ def checked_tensions(
     names, checked = (*extensor, *lines), {}
     for name, tension in tensions.items():
         if name not in names:
-            raise InputError(f"no muscle '{name}'", "tensions", names_near(name, list(names)))
+            raise InputError(
+                f"no muscle '{name}'", "tensions", names_near(name, dict.fromkeys(names))
+            )
         hint = "a muscle only pulls: give 0 or more"
         checked[name] = real_number(tension, f"muscle {name}: tension", hint)
         if not (math.isfinite(checked[name]) and checked[name] >= 0.0):
