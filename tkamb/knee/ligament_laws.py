@@ -57,8 +57,8 @@ class LigamentLaw(ABC):
 
     stiffness: float
     unit: ClassVar[Literal["N/m", "N per strain"]]
-    words: ClassVar[str]
-    source: ClassVar[str]
+    words: ClassVar[str] = "a law without a description"
+    source: ClassVar[str] = "no source stated"
 
     def __post_init__(self) -> None:
         for field in fields(self):
