@@ -433,7 +433,6 @@ def test_the_map_holds_a_ball_on_a_plate_with_the_closed_form(cell, depth):
 
 CURVE = np.linspace(0.0, 0.3, 31)
 TABLE = tabulated_material("table", CURVE, POLYETHYLENE.stress(CURVE), 0.45)
-"""The law of a table is not compiled."""
 
 
 class HalfLaw(LinearElastic):

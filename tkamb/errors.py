@@ -50,9 +50,7 @@ class ComputationError(TkambError):
 def must_be(value: object, kinds: type | tuple[type, ...], where: object, hint: str) -> None:
     """Raise an InputError if an argument is of none of the kinds."""
     if not isinstance(value, kinds):
-        shown = repr(value)
-        shown = shown if len(shown) < MAX_SHOWN else f"a {type(value).__name__}"
-        raise InputError(f"cannot be {shown}", where, hint)
+        raise _wrong_kind(value, where, hint)
 
 
 def all_of(kind: type[Kind], values: Iterable[Kind], where: str, hint: str) -> tuple[Kind, ...]:
@@ -77,8 +75,7 @@ def real_numbers(values: Any, where: object, hint: str) -> "np.ndarray":
     except ValueError as error:
         raise InputError(f"holds no numbers: {error}", where, hint) from None
     if array.dtype.kind not in "fiu" and array.size:
-        shown = f"an array of {array.dtype}" if array.shape else repr(values)
-        raise InputError(f"cannot be {shown}", where, hint)
+        raise _wrong_kind(array if array.shape else values, where, hint)
     return array.astype(float, copy=False)
 
 
@@ -90,8 +87,17 @@ def real_number(value: Any, where: object, hint: str) -> float:
     """
     array = real_numbers(value, where, hint)
     if array.shape:
-        must_be(value, (), where, hint)
+        raise _wrong_kind(array, where, hint)
     return float(array)
+
+
+def _wrong_kind(value: Any, where: object, hint: str) -> InputError:
+    shown = repr(value)
+    if hasattr(value, "dtype") and value.shape:
+        shown = f"an array of {value.dtype}, shape {value.shape}"
+    elif len(shown) > MAX_SHOWN:
+        shown = f"of type {type(value).__name__}"
+    return InputError(f"cannot be {shown}", where, hint)
 
 
 def not_installed(package: str, where: object, extra: str) -> InputError:

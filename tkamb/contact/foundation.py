@@ -1,29 +1,24 @@
 """Elastic foundation: a bed of independent springs under a rigid femoral component."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from tkamb.contact.flags import narrow_flags, unsupported_flags
-from tkamb.contact.materials import Material, ramberg_osgood_ratio
+from tkamb.contact.materials import Material
 from tkamb.contact.model import CondyleWrench, ContactModel, LoadedPoints, ProbedContact
 from tkamb.contact.pressing import PRESS, press_by_search
 from tkamb.contact.result import ContactResult, ContactStatus, Guess, WarmStart, medial_points
 from tkamb.contact.samples import (
     DEEPEST,
-    MAP_POINT,
     NEAR,
-    Body,
     Columns,
     Meeting,
-    Memory,
     Neighbourhood,
     SampledContact,
     SurfaceSamples,
     meet,
-    meet_nearby,
 )
 from tkamb.geometry.compiled import compiled_as_written
 from tkamb.geometry.frames import SIDES, Array, Index, Mask
@@ -321,35 +316,15 @@ class FoundationProbe:
     def sums(self, pose: Array) -> tuple[float, Array]:
         """Return the largest strain of the near columns, and the sums of both sides (2, `SUMS`)."""
         pose, sums = np.asarray(pose, float), np.zeros((2, SUMS))
-        state, numbers = self._state, self._numbers
-        split = np.inf if state.pair.split is None else state.pair.split
-        if numbers is None:  # the law is not compiled
-            near, meeting = self._columns(pose)
-            loaded = meeting.gap < 0
-            thickness = np.maximum(state.surface.thickness[near], LEAST_THICKNESS)
-            strain = np.where(loaded, -meeting.gap / thickness, 0.0)
-            deepest = float(strain.max(initial=0.0))
-            if deepest < DEEPEST:
-                pressure, slope = self._pressures(strain)
-                self._add_up(near, meeting, pressure, slope * loaded, pose, sums)
-        else:
-            area, steep = state.surface.area, MAP_POINT.side_start_normal_y
-            deepest, near, gap, gradient, patch = _sum_nearby(
-                *self.around.inputs, pose, steep, area, numbers, split, sums
-            )
-            self._last = pose.copy(), near, Meeting(gap, gradient, patch)
+        near, meeting = self._columns(pose)
+        loaded = meeting.gap < 0
+        thickness = np.maximum(self._state.surface.thickness[near], LEAST_THICKNESS)
+        strain = np.where(loaded, -meeting.gap / thickness, 0.0)
+        deepest = float(strain.max(initial=0.0))
+        if deepest < DEEPEST:
+            pressure, slope = self._pressures(strain)
+            self._add_up(near, meeting, pressure, slope * loaded, pose, sums)
         return deepest, sums
-
-    @cached_property
-    def _numbers(self) -> Array | None:
-        material = self._state.pair.material
-        numbers = material.ramberg_osgood
-        if self._law == "linear":
-            numbers = (0.0, 1.0, 1.0)
-        if numbers is None:
-            return None
-        linear = float(self._law == "linear")
-        return np.array([linear, material.confined_modulus, material.young_modulus, *numbers])
 
     def _pressures(self, strain: Array) -> tuple[Array, Array]:
         material = self._state.pair.material
@@ -423,50 +398,6 @@ class FoundationProbe:
         columns = near, state.surface.columns, state.surface.area
         met = meeting.gap, meeting.gradient, meeting.patch
         _add_up(*columns, *met, curvatures, pressure, slope, pose, split, sums)
-
-
-@compiled_as_written
-def _sum_nearby(
-    columns: Columns,
-    body: Body,
-    memory: Memory,
-    pose: Array,
-    steep: float,
-    area: Array,
-    numbers: Array,
-    split: float,
-    sums: Array,
-) -> tuple[float, Index, Array, Array, Index]:
-    """Return the largest strain, and the results of `meet_nearby`; write the sums of `_add_up`."""
-    near, gap, gradient, patch = meet_nearby(columns, body, memory, pose, steep)
-    pressure, slope, deepest = np.zeros(len(near)), np.zeros(len(near)), 0.0
-    for n in range(len(near)):
-        if gap[n] < 0.0:
-            strain = -gap[n] / max(columns[2][near[n]], LEAST_THICKNESS)
-            deepest = max(deepest, strain)
-            pressure[n], slope[n] = _layer(strain, numbers)
-    _add_up(
-        near, columns, area, gap, gradient, patch, body[2][4], pressure, slope, pose, split, sums
-    )
-    return deepest, near, gap, gradient, patch
-
-
-@compiled_as_written
-def _layer(strain: float, numbers: Array) -> tuple[float, float]:
-    """Return the results of `layer_pressure` and `layer_slope` at a strain in (0, 1).
-
-    Args:
-        numbers: (6,) one for the linear law, else zero; M and E, Pa; alpha, sigma0 (Pa) and n of
-            `RambergOsgood`, with alpha = 0 for a linear material.
-    """
-    linear, confined, young, alpha, reference, exponent = numbers
-    if linear:
-        return confined * strain, confined
-    stiffening = confined / young
-    elastic = stiffening * -np.log1p(-strain) * (young / reference)
-    ratio = elastic if alpha == 0.0 else ramberg_osgood_ratio(elastic, alpha, exponent)
-    tangent = young / (1.0 + alpha * exponent * ratio ** (exponent - 1.0))
-    return reference * ratio, tangent * stiffening / (1.0 - strain)
 
 
 @compiled_as_written

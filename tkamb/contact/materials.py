@@ -97,28 +97,23 @@ class RambergOsgood:
 
 
 @compiled_as_written
-def ramberg_osgood_ratio(elastic: float, alpha: float, exponent: float) -> float:
-    """Return the solution u of u + alpha u^n = elastic >= 0, with alpha > 0."""
-    # The solution with the elastic or the plastic term alone is an upper bound of u. Newton's
-    # method falls monotonically from the smaller bound, because the function is convex.
-    u, plastic = elastic, (elastic / alpha) ** (1.0 / exponent)
-    if plastic < u:
-        u = plastic
-    for _ in range(MOST_STEPS):
-        power = alpha * u ** (exponent - 1.0)
-        step = (u + power * u - elastic) / (1.0 + exponent * power)
-        u -= step
-        if u < 0.0:
-            u = 0.0
-        if not abs(step) > ROUNDING * u:  # also where it is NaN
-            break
-    return u
-
-
-@compiled_as_written
 def _solve_ratio(elastic: Array, alpha: float, exponent: float, ratio: Array) -> None:
+    """Write the solutions u (n,) of u + alpha u^n = elastic (n,), which is not negative."""
     for k in range(len(elastic)):
-        ratio[k] = ramberg_osgood_ratio(elastic[k], alpha, exponent)
+        # The solution with the elastic or the plastic term alone is an upper bound of u. Newton's
+        # method falls monotonically from the smaller bound, because the function is convex.
+        u, plastic = elastic[k], (elastic[k] / alpha) ** (1.0 / exponent)
+        if plastic < u:
+            u = plastic
+        for _ in range(MOST_STEPS):
+            power = alpha * u ** (exponent - 1.0)
+            step = (u + power * u - elastic[k]) / (1.0 + exponent * power)
+            u -= step
+            if u < 0.0:
+                u = 0.0
+            if not abs(step) > ROUNDING * u:  # also where it is NaN
+                break
+        ratio[k] = u
 
 
 @dataclass(frozen=True)
@@ -228,15 +223,6 @@ class Material:
         """Whether stress is proportional to strain."""
         # A subclass may have other stresses.
         return type(self.law) is LinearElastic
-
-    @property
-    def ramberg_osgood(self) -> tuple[float, float, float] | None:
-        """alpha, reference stress (Pa) and exponent; alpha is 0 if linear; None: another law."""
-        if self.is_linear:
-            return 0.0, self.young_modulus, 1.0
-        if type(self.law) is not RambergOsgood:
-            return None
-        return self.law.alpha, self.law.reference_stress, self.law.exponent
 
     @property
     def shear_modulus(self) -> float:

@@ -283,7 +283,7 @@ class PatellaMethod:
             on_knee = self._on_knee(plane, body, balance, force)
             if on_knee is None:
                 # Other lines hold the patella: a larger tension makes the strands taut.
-                tension *= 2.0
+                tension, change = 2.0 * tension, np.inf
                 continue
             trial, loads = solve(on_knee)
             if loads.problems:

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tkamb.contact.lattice.initial_guess import LatticeStart
+from tkamb.contact.lattice.initial_guess import LEVER_ARM, LatticeStart
 from tkamb.contact.lattice.linear.compliance import ContactResponse
 from tkamb.contact.lattice.linear.operator import prepare_operator
 from tkamb.contact.lattice.problem import ContactProblem, LatticeState
@@ -31,11 +31,8 @@ from tkamb.geometry.frames import Array, Index, displaced
 
 SURFACE_STEP = 1e-7
 """m: step of the central differences of the femoral surface; a rotation's step is this over
-`LEVER_ARM`. It is far below the
-size of a facet, and rounding errors of the rays, about 1e-15 m, are 1e-8 of it."""
-
-LEVER_ARM = 0.03
-"""m: distance from the femoral axis to the contact."""
+`LEVER_ARM`. It is far below the size of a facet, and rounding
+errors of the rays, about 1e-15 m, are 1e-8 of it."""
 
 
 def exact_force_changes(
