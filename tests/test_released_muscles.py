@@ -16,7 +16,7 @@ from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.knee.crossing import CrossingLines, MuscleShare
 from tkamb.knee.load import total_wrench
-from tkamb.knee.released import Relaxation
+from tkamb.knee.relaxation import Relaxation
 from tkamb.knee.released_forces import SCALE, ReleasedForces, external_wrench
 from tkamb.run.muscles.shared_muscles import SharedMuscles
 from tkamb.run.read_scene import recording_of
