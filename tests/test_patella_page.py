@@ -17,6 +17,13 @@ def test_the_block_agrees_with_the_stored_numbers():
     assert text == with_block(text, tradeoff(), "patella")
 
 
+def test_the_words_beside_the_table_agree_with_it():
+    """At both ends the ratio lies above the published range; short retinacula double it."""
+    start, end = (stored()["rows"][k]["ratio"] for k in (0, -1))
+    assert 1.05 * 0.29 < start[0] < 1.15 * 0.29 and 1.8 < max(start) / start[0] < 2.2
+    assert end[0] > 1.04
+
+
 def test_a_stored_row_is_computed_again(tmp_path):
     """One frame alone, with the coarse start of a first frame, has the same equilibrium."""
     button = {"model": "foundation", "resolution_mm": 1.0}
