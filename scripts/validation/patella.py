@@ -26,9 +26,10 @@ MEANT = """\
 The retinacula have the length of extension as slack length, because their strain rises from
 extension: native medial patellofemoral ligament of twelve cadaver knees, J Exp Orthop 6 (2019),
 doi:10.1186/s40634-019-0195-3, abstract. The assumed ones slacken with flexion, so that they hardly
-act. Near extension the ratio is a tenth above the published range; with retinacula 2 mm shorter it is
-twice as large. At the end of the bend it is above the range too, as with the plane patella. The sign of tilt and shift depends on the assumed shares of the heads. Contact area rises
-with the force. The tension of the quadriceps is that of the equations with this patella."""
+act. Near extension the ratio is a tenth above the published range; with retinacula 2 mm shorter it
+is twice as large. At the end of the bend it is above the range too, as with the plane patella. The
+sign of tilt and shift depends on the assumed shares of the heads. Contact area rises with the
+force. The tension of the quadriceps is that of the equations with this patella."""
 TIMED = """\
 `scripts/measure/patella` on {date}, code {code}: the shipped knee bend, every second
 frame, femorotibial contact by the foundation at 1 mm, one thread, load of the machine

@@ -32,8 +32,8 @@ GROUPS = {
 """Group of entry points -> kind of the plug-ins of the group."""
 
 
-CONTACT_CODE = "code of the contact model"
-"""Key of the identity for the hash of a plug-in."""
+CODE, CONTACT_CODE = "code of tkamb", "code of the contact model"
+"""Keys of the identity for the hashes of tkamb and of a plug-in."""
 SUFFIXES = (".py", ".so", ".pyd")
 
 
@@ -135,7 +135,7 @@ def run_identity(case: "Case", frames: range) -> dict[str, Any]:
         "content of a file": files_hash(case),
         "choice of frames": [frames.start, frames.stop, frames.step],
         "version of tkamb": __version__,
-        "code of tkamb": code_identity(),
+        CODE: code_identity(),
     }
     contact = case.scene.contact
     foreign = None if contact is None else contact_code(contact.model)

@@ -19,7 +19,7 @@ from tkamb import __version__, code_identity
 from tkamb.errors import InputError
 from tkamb.files import MESH_BYTES, check_replaced, sha256_of
 from tkamb.run.columns import KINDS, SECONDS
-from tkamb.run.identity import CONTACT_CODE, contact_code, overrides_of_run, preset_of_run
+from tkamb.run.identity import CODE, CONTACT_CODE, contact_code, overrides_of_run, preset_of_run
 from tkamb.run.results_folder import (
     BUTTON_NAME,
     CSV_NAME,
@@ -111,7 +111,7 @@ def _notes(summary: Mapping[str, Any]) -> list[str]:
     identity = summary.get("identity")
     identity = identity if isinstance(identity, Mapping) else {}
     notes, made_by = [], identity.get("version of tkamb")
-    code, this = str(identity.get("code of tkamb")), code_identity()
+    code, this = str(identity.get(CODE)), code_identity()
     if made_by != __version__ or code != this:
         notes.append(
             f"computed by other code (tkamb {made_by}, {code[:12]}; "

@@ -12,7 +12,7 @@ from tkamb.geometry.frames import Array, Index
 from tkamb.run import metrics
 from tkamb.run.claims import peaks_of
 from tkamb.run.columns import KINDS, SECONDS
-from tkamb.run.identity import CONTACT_CODE
+from tkamb.run.identity import CODE, CONTACT_CODE
 from tkamb.run.metrics import failed
 from tkamb.run.results import Results
 from tkamb.run.results_folder import read_results
@@ -288,7 +288,7 @@ def _notes(runs: Sequence[Run]) -> list[str]:
     versions = [run.results.summary.get("versions") or {} for run in runs]
     for name in sorted({name for one in versions for name in one}):
         notes += _unlike(runs, f"the version of {name}", [one.get(name) for one in versions])
-    for code in ("code of tkamb", CONTACT_CODE):
+    for code in (CODE, CONTACT_CODE):
         codes = [(run.results.summary.get(VERSIONS) or {}).get(code) for run in runs]
         notes += _unlike(runs, code, codes)
     for run in runs:

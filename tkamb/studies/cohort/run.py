@@ -21,7 +21,7 @@ from tkamb.errors import InputError, not_installed
 from tkamb.files import replaced_together, sha256_of, write_rows, write_synced
 from tkamb.io.claim import claimed_directory, is_ours
 from tkamb.run.columns import ordered_names
-from tkamb.run.identity import CONTACT_CODE, contact_code
+from tkamb.run.identity import CODE, CONTACT_CODE, contact_code
 from tkamb.run.recorder import Shards, completed, stored
 from tkamb.run.results_folder import remove_shards
 from tkamb.run.workers import PoolOptions, Progress, Task
@@ -254,7 +254,7 @@ def run_cohort(
 
 
 def _identity(cohort: Cohort) -> dict[str, Any]:
-    code: dict[str, Any] = {"version of tkamb": __version__, "code of tkamb": code_identity()}
+    code: dict[str, Any] = {"version of tkamb": __version__, CODE: code_identity()}
     models = sorted({run.scene.contact.model for run in cohort.runs if run.scene.contact})
     foreign = {name: result for name in models if (result := contact_code(name)) is not None}
     return cohort.identity() | code | ({CONTACT_CODE: foreign} if foreign else {})
