@@ -202,6 +202,7 @@ class CellContact(ContactModel):
         load: float,
         pose: Array,
         start: Guess | None = None,
+        forces_only: bool = False,
     ) -> tuple[ContactResult, WarmStart]:
         """Return the contact under a load (N) and a warm start; see `evaluate_from`."""
         check_load(load)
@@ -227,7 +228,7 @@ class CellContact(ContactModel):
             depth = start.approach
         else:
             depth = guessed_depth(state.problem, gaps, state.surface.area, load)
-        return self._solved(state, pose, load, (gaps, planes), depth, start)
+        return self._solved(state, pose, load, (gaps, planes), depth, start, forces_only)
 
     def probe(self, state: LatticeState, guess: Guess | None = None) -> Probe:
         """Return a probe that also gives the stiffness; see `ContactModel`."""
@@ -267,7 +268,7 @@ class CellContact(ContactModel):
             if approach <= covered:
                 rule = self.pressure_rule
                 result = result_of(state, pose, load, gaps, solution, rule, forces_only)
-                if load is not None:
+                if load is not None and not forces_only:
                     below_first = approach + max(-float(gaps.min()), 0.0)
                     flags = unseen_flags(state, result, below_first)
                     result = within_insert(state, result, *flags)

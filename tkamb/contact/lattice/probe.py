@@ -55,16 +55,28 @@ class LatticeProbe(Probe):
         Near the last pose at which the whole solid was evaluated, only the region is evaluated.
         """
         model = self._lattice_model
-        if self._measured is not None:
-            # The step has no height: the limit on the forces covers its change.
-            step = step_between(self._measured[0], pose)
-            if np.linalg.norm(step) <= REGION_HOLDS_WITHIN * self._state.lattice.spacing.min():
-                result, start = model.evaluate_from(self._state, pose, self.start, True)
-                if np.linalg.norm(result.nodal_force) <= REGION_HOLDS_TO * self._measured[1]:
-                    return result, start
+        if self._measured is not None and self._near(self._measured[0], pose):
+            result, start = model.evaluate_from(self._state, pose, self.start, True)
+            if np.linalg.norm(result.nodal_force) <= REGION_HOLDS_TO * self._measured[1]:
+                return result, start
         result, start = model.evaluate_from(self._state, pose, self.start)
         self._measured = pose, float(np.linalg.norm(result.nodal_force))
         return result, start
+
+    def pressed(
+        self, load: float, pose: Array, start: Guess | None
+    ) -> tuple[ContactResult, WarmStart]:
+        """Return the contact and a warm start under a load (N); only the forces are correct.
+
+        Near the pose of `start`, whose whole solid was evaluated, only the region is evaluated.
+        """
+        near = start is not None and self._near(start.pose, pose)
+        return self._lattice_model.press_from(self._state, load, pose, start, near)
+
+    def _near(self, measured: Array, pose: Array) -> bool:
+        # The step has no height: a limit on the forces covers its change.
+        size = float(np.linalg.norm(step_between(measured, pose)))
+        return size <= REGION_HOLDS_WITHIN * float(self._state.lattice.spacing.min())
 
     def seen(self, result: ContactResult, start: WarmStart | None = None) -> ProbedContact:
         """Return the condyles' forces of a result, with their stiffness."""
