@@ -155,3 +155,23 @@ def test_at_far_poses_the_region_alone_would_miss_the_residual(usual):
     _, start = model.evaluate_from(state, pose)
     result, end = model.evaluate_from(state, moved(pose, np.array([3e-3, *[0.0] * 5])), start, True)
     assert residual(state, result, end) > 2 * model.settings.force_tolerance
+
+
+def test_a_press_near_its_start_begins_with_the_last_change_and_evaluates_the_region(
+    usual, monkeypatch
+):
+    model, state, pose = usual
+    probe, start, passes, alone = model.probe(state), None, [], []
+    for step in range(4):
+        at = moved(pose, np.array([1e-4 * step, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        turned = moved(at, np.array([0.0, 0.0, 0.0, 3e-4, 0.0, 0.0]))
+        _, start = model.press_from(state, 800.0, at, start)
+        with monkeypatch.context() as context:
+            context.delattr(type(state.problem.solid), "forces")
+            result, end = probe.pressed(800.0, turned, start)
+            alone.append(model.probe(state).pressed(800.0, turned, start)[0].iterations)
+        passes.append(result.iterations)
+        assert residual(state, result, end) < 1.2 * model.settings.force_tolerance
+        whole = model.press(state, 800.0, turned).nodal_force
+        assert np.linalg.norm(result.nodal_force - whole) < 2e-3 * np.linalg.norm(whole)
+    assert sum(passes) < sum(alone)

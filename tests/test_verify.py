@@ -17,7 +17,7 @@ from tkamb.errors import InputError
 from tkamb.io.scene import load_scene
 from tkamb.run.identity import input_hashes
 from tkamb.run.recorder import Shard, Shards
-from tkamb.run.results_folder import _summary_hash, read_results, write_results
+from tkamb.run.results_folder import read_results, write_results
 from tkamb.show.comparison import SAME, compare_folders
 from tkamb.show.comparison_page import comparison_html, table_lines
 
@@ -111,28 +111,6 @@ def test_every_command_reports_changed_results(run, capfd, change, words):
         assert words in capfd.readouterr().err
     with pytest.raises(InputError, match=words):
         read_results(out)
-
-
-@pytest.mark.parametrize("code", ["another", None])
-def test_a_folder_of_another_version_is_named_and_a_fault_of_tkamb_is_not_its(
-    run, capfd, monkeypatch, code
-):
-    """A value is of another kind. The sums of the summary are right in both cases."""
-    _, out = run
-    path = out / "summary.json"
-    summary = json.loads(path.read_text())
-    summary["versions"] = 3  # a table in this version
-    if code:
-        summary["identity"]["code of tkamb"] = code
-    summary["summary_sha256"] = _summary_hash(summary)
-    path.write_text(json.dumps(summary))
-    monkeypatch.chdir(out.parent)  # the log of a fault
-    status, words = main(["methods", str(out)]), capfd.readouterr().err
-    if code:
-        assert status == 2 and f"{out}: was written by another version" in words
-        assert len(words.splitlines()) == 1 and "run the scene again" in words
-    else:
-        assert status == 1 and "unexpected error" in words
 
 
 def test_changed_input_files_are_named(finished, tmp_path, capfd):

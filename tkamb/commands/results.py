@@ -19,10 +19,7 @@ _NAMES = ("folder", "folders", "runs", "path", "case")
 
 @contextmanager
 def reading_results(options: argparse.Namespace) -> Iterator[None]:
-    """Name the folders of another version of tkamb in the error of a command that they end.
-
-    A fault in a folder of this version is one of tkamb, and stays as it is.
-    """
+    """Name the folders of results in the error of a command that cannot use their content."""
     try:
         yield
     except (TkambError, OSError, MemoryError):
@@ -30,25 +27,12 @@ def reading_results(options: argparse.Namespace) -> Iterator[None]:
     except Exception as error:  # content of another kind raises errors of many types
         given = [getattr(options, name, None) or [] for name in _NAMES]
         paths = [path for each in given for path in (each if isinstance(each, list) else [each])]
-        folders = [str(path) for path in paths if _is_of_other_code(Path(path))]
+        folders = [str(path) for path in paths if (Path(path) / "summary.json").is_file()]
         if not folders:
             raise
         words = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-        what = f"was written by another version of tkamb, and this one cannot read it ({words})"
+        what = f"cannot be read by this version of tkamb ({words})"
         raise InputError(what, ", ".join(folders), "run the scene again") from error
-
-
-def _is_of_other_code(folder: Path) -> bool:
-    """Return whether a folder has a summary of a run that other code than this computed."""
-    from tkamb import code_identity
-    from tkamb.run.identity import CODE
-    from tkamb.run.results_folder import SUMMARY_NAME, read_summary
-
-    if not (folder / SUMMARY_NAME).is_file():
-        return False
-    identity = read_summary(folder).get("identity")
-    code = identity.get(CODE) if isinstance(identity, dict) else None
-    return code != code_identity()
 
 
 def add_compare(commands: Any) -> None:

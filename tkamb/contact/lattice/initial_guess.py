@@ -57,19 +57,27 @@ class LatticeStart(WarmStart):
         across = np.linalg.norm(step - share * change)
         if share <= 0 or across > LARGEST_TURN * np.linalg.norm(step):
             return self
-        both = (self.displacement != 0) & (last.displacement != 0)
-        moved = np.where(both, self.displacement - last.displacement, 0.0)
-        return replace(
-            self,
-            loads=_continued(last.loads, self.loads, share),
-            half=_continued(last.half, self.half, share),
-            displacement=self.displacement + share * moved,
-        )
+        return self.plus(last, self, share)
+
+    def plus(
+        self, first: "LatticeStart", second: "LatticeStart", share: float = 1.0
+    ) -> "LatticeStart":
+        """Return this state plus a share of the change from a first to a second state."""
+        both = (self.displacement != 0) & (first.displacement != 0) & (second.displacement != 0)
+        moved = np.where(both, second.displacement - first.displacement, 0.0)
+        loads = _plus(self.loads, first.loads, second.loads, share)
+        half = _plus(self.half, first.half, second.half, share)
+        displacement = self.displacement + share * moved
+        return replace(self, loads=loads, half=half, displacement=displacement)
 
 
-def _continued(last: Array | None, value: Array | None, share: float) -> Array | None:
-    """Return a value plus a share of its last change; None if one of them is unknown."""
-    return None if last is None or value is None else value + share * (value - last)
+def _plus(
+    value: Array | None, first: Array | None, second: Array | None, share: float
+) -> Array | None:
+    """Return a value plus a share of a change; None if one of them is unknown."""
+    if value is None or first is None or second is None:
+        return None
+    return value + share * (second - first)
 
 
 def step_between(start: Array, end: Array) -> Array:

@@ -48,6 +48,8 @@ class LatticeProbe(Probe):
         self._lattice_model, self._accuracy = model, accuracy
         self._measured: tuple[Array, float] | None = None
         """Last pose at which the whole solid was evaluated, and norm of the forces there, N."""
+        self._pressed: tuple[LatticeStart, LatticeStart] | None = None
+        """States before and after the last press near its start."""
 
     def evaluated(self, pose: Array) -> tuple[ContactResult, WarmStart]:
         """Return the contact at a pose, and a warm start.
@@ -71,7 +73,15 @@ class LatticeProbe(Probe):
         Near the pose of `start`, whose whole solid was evaluated, only the region is evaluated.
         """
         near = start is not None and self._near(start.pose, pose)
-        return self._lattice_model.press_from(self._state, load, pose, start, near)
+        begin = begun = lattice_start(self._state, start)
+        if begun is not None and near and self._pressed is not None:
+            begin = replace(begun.plus(*self._pressed), before=None)
+        result, end = self._lattice_model.press_from(
+            self._state, load, pose, start if begin is None else begin, near
+        )
+        solved = lattice_start(self._state, end)
+        self._pressed = (begun, solved) if begun and solved and near else None
+        return result, end
 
     def _near(self, measured: Array, pose: Array) -> bool:
         # The step has no height: a limit on the forces covers its change.
