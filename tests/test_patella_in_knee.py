@@ -122,6 +122,26 @@ def test_virtual_work_of_the_whole_extensor(plain, frame):
     assert abs(moment) > 10.0
 
 
+@pytest.mark.parametrize("frame", [40, 90])
+def test_the_work_of_the_patella_over_a_closed_loop_vanishes(plain, open_knee, frame):
+    """Tensions, contact and elastic ligaments have an energy, whose minimum is that of the knee."""
+    model, data = open_knee.model, open_knee.create_data()
+    kinematics, centre = model.createData(), plain[1].q[frame]
+    size, phase = np.zeros(model.nv), np.zeros(model.nv)
+    for k, name in enumerate(("ap", "si", "ml", "axial_rotation", "adduction", "flexion")):
+        joint = model.joints[model.getJointId(f"knee_{name}")].idx_v
+        size[joint] = (1.5e-3, 5e-4, 5e-4, 0.02, 0.005, 0.04)[k]
+        phase[joint] = k
+    power = []
+    for turn in 2.0 * np.pi * np.arange(40) / 40:
+        q = pin.integrate(model, centre, size * (np.sin(turn + phase) - np.sin(phase)))
+        forces = open_knee.external_forces(q, 0.0 * size, HEADS, data)
+        pin.forwardKinematics(model, kinematics, q, size * np.cos(turn + phase))
+        pairs = zip(forces, kinematics.v, strict=True)
+        power.append(sum(force.dot(velocity) for force, velocity in pairs))
+    assert abs(np.mean(power)) < 1e-6 * np.mean(np.abs(power))
+
+
 def test_a_number_is_the_tension_of_all_heads(plain, open_knee):
     q, v = plain[1].q[60], plain[1].v[60]
     by_head, total = (open_knee.external_forces(q, v, given) for given in (HEADS, SIZE))
