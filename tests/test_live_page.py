@@ -46,6 +46,8 @@ def test_the_page_of_a_knee_object_has_no_frames(page):
     assert page.evaluate("() => document.getElementById('pose-frame')") is None
     assert page.evaluate("() => tkamb.bench.answer.request.load_N") == 800.0
     assert page.evaluate("() => document.getElementById('pose-thickness_mm')") is None
+    assert page.evaluate("() => document.getElementById('pose-quadriceps_N')") is None
+    assert page.evaluate("() => document.getElementById('patella').hidden")
 
 
 def test_a_key_moves_a_slider_and_the_fine_model_is_computed(page):

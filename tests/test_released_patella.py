@@ -272,23 +272,6 @@ def test_a_failed_run_has_the_columns_of_the_button(tmp_path):
     assert np.isnan(results["button_force_N"][0]) and np.isnan(results["patella_tilt_deg"][0])
 
 
-def test_live_leaves_the_patella_out(scene, tmp_path):
-    from tkamb.io.scene.case import load_case
-    from tkamb.show.view.live import LiveKnee
-
-    released, plane = (
-        LiveKnee(load_case(tkamb.load_scene(path)))
-        for path in (scene, write_scene(tmp_path / "plane"))
-    )
-    mine, other = (knee.answer(knee.recorded(40)) for knee in (released, plane))
-    assert not mine.failed
-    for name, value in other.numbers.items():
-        if not name.endswith("_seconds"):
-            assert mine.numbers[name] == pytest.approx(value, rel=1e-9, nan_ok=True), name
-    results = tkamb.simulate(released.save(released.recorded(40), tmp_path / "kept"))
-    assert not any(name.startswith("button") for name in results.columns)
-
-
 @pytest.mark.parametrize("released", [(), ("ap", "ml", "axial_rotation", "adduction")])
 def test_muscles_of_the_leg_pull_the_released_patella(released):
     """Static optimisation, equations and patella agree on the tension of the quadriceps."""

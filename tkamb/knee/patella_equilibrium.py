@@ -87,15 +87,11 @@ def find_equilibrium(
         InputError: see there.
         ComputationError: see there.
     """
-    numbers = released_numbers(released)
-    kinematics = knee._kinematics(data, q)
-    body, guesses = _search(knee, kinematics, tensions, len(numbers) == 6, data)
-    found = found_patella(body, guesses, numbers)
+    body, found = find_at(knee, knee._kinematics(data, q), tensions, released, data)
     balance, button = found.balance, body.button
     place = body.joint @ patella_pose(balance.coordinates)
     contact, forces = None, pin.StdVec_Force()
     if found.press is not None:
-        data.patella_coordinates = balance.coordinates
         contact = patella_of_user(found.press, found.poses, button.in_patella, knee.left)
         links = _link_wrenches(found, body)
         forces = knee.bridge.joint_forces(data.data, links)
@@ -113,12 +109,34 @@ def find_equilibrium(
     )
 
 
+def find_at(
+    knee: "Knee",
+    kinematics: "KneePose",
+    tensions: Mapping[str, float],
+    released: Sequence[str],
+    data: "KneeData",
+    bones: Mapping[str, Array] | None = None,
+) -> tuple[PatellaBody, FoundPatella]:
+    """Return the forces on the patella at a pose of the knee, and its equilibrium.
+
+    `bones` is that of `PatellaMethod.body_of_heads`, the other arguments and the errors are those
+    of `Knee.patella_equilibrium`.
+    """
+    numbers = released_numbers(released)
+    body, guesses = _search(knee, kinematics, tensions, len(numbers) == 6, data, bones)
+    found = found_patella(body, guesses, numbers)
+    if found.press is not None:
+        data.patella_coordinates = found.balance.coordinates
+    return body, found
+
+
 def _search(
     knee: "Knee",
     kinematics: "KneePose",
     tensions: Mapping[str, float],
     warm: bool,
     data: "KneeData",
+    bones: Mapping[str, Array] | None = None,
 ) -> tuple[PatellaBody, list[Callable[[], Array]]]:
     """Return the forces on the patella at the pose of q, and functions that return initial guesses.
 
@@ -138,7 +156,7 @@ def _search(
         method = patella_method(knee, None, PATELLA_BODY_COORDINATES)
     _check_pull(method, tensions)
     # Each search has its own probe: the warm start of the contact is not part of the result.
-    body = method.body_of_heads(poses, tensions)
+    body = method.body_of_heads(poses, tensions, bones=bones)
     guesses: list[Callable[[], Array]] = []
     last = data.patella_coordinates
     if last is not None and warm:

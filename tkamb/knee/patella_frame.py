@@ -181,6 +181,7 @@ class PatellaMethod:
         poses: Mapping[str, Array],
         tensions: Mapping[str, float],
         probe: "Probe | None" = None,
+        bones: Mapping[str, Array] | None = None,
     ) -> PatellaBody:
         """Return the forces on the patella from the tensions of its heads.
 
@@ -188,19 +189,27 @@ class PatellaMethod:
             poses: link -> pose (4, 4) in the insert frame of femur and tibia.
             tensions: head -> tension, N; a head without one is slack.
             probe: see `balanced`.
+            bones: link -> pose (4, 4) in the link of its bone, which has the attachments and the
+                patella's joint. The outline and the component are those of the link. None: bones
+                and links are the same.
         """
+        bones = {"patella": np.eye(4), "femur": np.eye(4), "tibia": np.eye(4)} | dict(bones or {})
         heads = [
             Head(
                 head.name,
-                self._point(head.origin, "femur"),
+                transform(bones["femur"], self._point(head.origin, "femur")),
                 self._point(head.insertion, "patella"),
                 self.outline,
                 tensions.get(head.name, 0.0),
             )
             for head in self.heads
         ]
-        probe, joint = probe or self.button.contact.probe(), self.chain.patella_joint_in_femur
-        return PatellaBody(self.button, probe, joint, heads, self.carried, poses)
+        joint = bones["femur"] @ self.chain.patella_joint_in_femur
+        placed = {link: (link, bone) for link, bone in bones.items()}
+        lines = [line.on_links(placed) for line in self.carried]
+        return PatellaBody(
+            self.button, probe or self.button.contact.probe(), joint, heads, lines, poses
+        )
 
     def solved(
         self, geometry: KneeGeometry, solve: Solve, start: Array | None = None

@@ -1,7 +1,7 @@
 """Rows and columns of results.csv from the frames, which are in SI units."""
 
 from array import array
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from sys import intern
 from typing import TYPE_CHECKING, Any
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from tkamb.knee.crossing import MuscleShare
     from tkamb.knee.found_patella import FoundPatella
     from tkamb.knee.frame import Frame
+    from tkamb.knee.ligaments import Ligament
     from tkamb.knee.slip import CondyleSlip
     from tkamb.knee.unknowns import CondylePoint
 
@@ -74,9 +75,9 @@ def frame_row(
     for side, slip in slips.items():
         row |= _slip_row(case, k, side, slip, frame.geometry.condyles.get(side))
     if case.scene.contact is not None and case.scene.contact.patellofemoral is not None:
-        row |= _button_row(frame.button)
+        row |= button_row(frame.button)
     if case.patella_ligaments:
-        row |= _patella_row(case, frame.patella)
+        row |= patella_row(case.patella_ligaments, frame.patella)
     if frame.pressed:
         row |= _contact_row(frame, case.yield_stress)
         row |= _pose_row(frame)
@@ -284,7 +285,8 @@ def _post_row(post: "PostContact") -> dict[str, float]:
     }
 
 
-def _button_row(press: "ButtonPress | None") -> dict[str, float]:
+def button_row(press: "ButtonPress | None") -> dict[str, float]:
+    """Return the columns of a press of the button; NaN without a contact."""
     names = [each.name.removeprefix("button_") for each in COLUMNS if each.needs == BUTTON_NEEDS]
     values = dict.fromkeys(names, NAN)
     if press is not None:
@@ -311,7 +313,8 @@ def _button_row(press: "ButtonPress | None") -> dict[str, float]:
     return {f"button_{name}": value for name, value in values.items()}
 
 
-def _patella_row(case: Case, found: "FoundPatella | None") -> dict[str, float]:
+def patella_row(lines: "Sequence[Ligament]", found: "FoundPatella | None") -> dict[str, float]:
+    """Return the columns of a released patella with its ligaments; NaN without an equilibrium."""
     lost = found is None or bool(found.problem)
     balance = None if found is None or lost else found.balance
     places = np.full(6, NAN) if balance is None else balance.coordinates
@@ -321,7 +324,7 @@ def _patella_row(case: Case, found: "FoundPatella | None") -> dict[str, float]:
         unit, size = ("mm", MILLIMETRE) if is_place else ("deg", DEGREE)
         row[f"patella_{name}_{unit}"] = value / size
     tensions = found.tensions if found else {}
-    for bundle in case.patella_ligaments:
+    for bundle in lines:
         row[family_column(PATELLA_LINE, bundle.name)] = tensions.get(bundle.name, NAN)
     return row
 

@@ -1,6 +1,7 @@
 """The knee of `tkamb live`: one pose, an axial load, placement and ligaments changed by the user.
 
-A `BenchRequest` becomes a static case without muscles and patella. The axial load acts along the
+A `BenchRequest` becomes a static case without muscles and patella. A released patella is added to
+the result (`tkamb.show.view.bench_patella`). The axial load acts along the
 tibia's long axis, through the origin of the insert frame of the scene. This line of action is fixed
 to the bone, also if the user moves the insert. `tkamb run` gives the same numbers for the scene
 that `bench_scene.write_bench` writes.
@@ -49,6 +50,8 @@ RANGES = {
     "load_N": (0.0, 15_000.0),
     # Ligaments of the knee rupture at strains of 12 to 20 %.
     "slack_percent": (-20.0, 20.0),
+    # The patellar ligament of a weightlifter ruptured at 14.5 kN (Zernicke et al. 1977).
+    "quadriceps_N": (0.0, 15_000.0),
     # A finer map cannot follow a slider. The coarsest is the limit in `MapGridSettings`.
     "resolution_mm": (0.5, 10.0),
     # Inserts are sold with 6 to 20 mm.
@@ -103,10 +106,11 @@ class BenchRequest:
         ap_mm: anterior position of the femoral component, insert frame; `ml_mm` is lateral.
         load_N: axial load along the tibia, through the origin of the recorded insert frame, N.
         tibial: placement of the insert on the tibia.
-        slack_percent: change of the slack lengths of all ligaments, %.
+        slack_percent: change of the slack lengths of all ligaments between femur and tibia, %.
         released: names of the coordinates that are found by equilibrium.
         contact: name of the contact model; `resolution_mm` is its spacing.
         thickness_mm: smallest thickness of a parametric insert; None: the insert of the scene.
+        quadriceps_N: tension of the quadriceps on a released patella, N; None: no patella.
     """
 
     flexion_deg: float = 0.0
@@ -122,6 +126,7 @@ class BenchRequest:
     contact: str = "foundation"
     resolution_mm: float = 2.0
     thickness_mm: float | None = None
+    quadriceps_N: float | None = None
 
     @staticmethod
     def read(values: Mapping[str, Any]) -> "BenchRequest":
@@ -138,7 +143,7 @@ class BenchRequest:
                 arguments[key] = _released(value)
             elif key == "contact":
                 arguments[key] = str(value)
-            elif key == "thickness_mm" and value is None:
+            elif key in ("thickness_mm", "quadriceps_N") and value is None:
                 arguments[key] = None
             else:
                 arguments[key] = _number(key, value, *RANGES[key])
@@ -154,6 +159,18 @@ class BenchRequest:
             "flexion": self.flexion_deg * DEGREE,
         }
         return np.array([values.get(name, 0.0) for name in KNEE_COORDINATES])
+
+    def bones(self, insert_in_tibia: Array) -> dict[str, Array]:
+        """Return link -> pose (4, 4) of its bone in the link.
+
+        If the user moves a component, its pose in the link does not change. Instead the bone and
+        its attachments move in the opposite direction.
+
+        Args:
+            insert_in_tibia: pose of the insert frame in the link "tibia", shape (4, 4).
+        """
+        tibia = insert_in_tibia @ inverse(self.tibial.matrix()) @ inverse(insert_in_tibia)
+        return {"femur": inverse(self.femoral.matrix()), "tibia": tibia}
 
 
 def _number(key: str, value: Any, low: float, high: float) -> float:
@@ -262,7 +279,7 @@ class Bench:
         bone. A second force balances the shank's weight. The two forces are returned as their
         resultant at the centre of pressure (y = 0) with its free moment about y.
         """
-        chain, moved = self.case.chain, self._bone(request)
+        chain, moved = self.case.chain, self._bones(request)["tibia"]
         axial = moved[:3, 1] * request.load_N
         mass, centre, _ = chain.segment("tibia")
         weight = -mass * np.array(chain.model.gravity.linear)
@@ -273,17 +290,11 @@ class Bench:
         forces, points, moments = (np.tile(values, (ROWS, 1)) for values in (force, point, moment))
         return GroundReaction(forces, points, moments, np.ones(ROWS, bool))
 
-    def _bone(self, request: BenchRequest) -> Array:
-        """Return the pose (4, 4) of the tibial bone in the link "tibia" of the case.
-
-        If the user moves the insert, its pose in the link "tibia" does not change. Instead the bone
-        and its attachments move in the opposite direction.
-        """
-        insert = self.case.chain.insert_in_tibia
-        return insert @ inverse(request.tibial.matrix()) @ inverse(insert)
+    def _bones(self, request: BenchRequest) -> dict[str, Array]:
+        return request.bones(self.case.chain.insert_in_tibia)
 
     def _bundle(self, bundle: "Ligament", request: BenchRequest) -> "Ligament":
-        moved = {"femur": inverse(request.femoral.matrix()), "tibia": self._bone(request)}
+        moved = self._bones(request)
         return replace(
             bundle.on_links({link: (link, moved.get(link, np.eye(4))) for link in bundle.links}),
             slack_length=bundle.slack_length * (1.0 + request.slack_percent / 100.0),

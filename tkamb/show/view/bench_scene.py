@@ -243,7 +243,7 @@ def _bundles(knee: Knee, tibia: Array) -> "list[Ligament]":
         tibia: (4, 4) pose of the knee's tibia link in the tibia link of the scene.
     """
     bundles: list[Ligament] = []
-    for bundle in knee.ligaments:
+    for bundle in knee._instant_ligaments:
         if set(bundle.links) != {"femur", "tibia"}:
             logger.warning("%s: not between femur and tibia: not on the bench", bundle.name)
             continue

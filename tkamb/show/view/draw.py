@@ -81,7 +81,7 @@ def draw(
         statuses=tuple(results.status),
         readings=readings(results, axis),
         solids=solids(case, recording.poses[list(run.frames)], states, maps, rows)
-        + patella_solids(case, _patella_poses(run, states, button))
+        + patella_solids(recording.knee, _patella_poses(run, states, button))
         + others,
         strands=tuple(strands),
         arrows=force_arrows(results, geometries, contact.friction if contact else 0.0),

@@ -3,7 +3,7 @@
 The magnitude of a force comes from results.csv, its line of action from the geometry of the frame.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,7 +33,8 @@ from tkamb.show.view.drawing import (
 from tkamb.units import MILLIMETRE
 
 if TYPE_CHECKING:
-    from tkamb.knee.patella_frame import PatellaMethod
+    from tkamb.knee.found_patella import FoundPatella
+    from tkamb.knee.ligaments import Ligament
     from tkamb.run.results import Results
 
 NOTHING = np.full(3, np.nan)
@@ -253,7 +254,14 @@ def extensor_strands(
     if extensor is None:
         return ()
     if recording.knee.patella is not None:
-        return _released_strands(recording.knee.patella, geometries)
+        method = recording.knee.patella
+        loads = [one.extensor.released if one.extensor else None for one in geometries]
+        return released_strands(
+            [head.name for head in method.heads],
+            method.carried,
+            [one.paths if one else {} for one in loads],
+            [one.found if one else None for one in loads],
+        )
     paths: list[tuple[TautPath | None, ...]] = []
     for state in states:
         try:
@@ -269,22 +277,30 @@ def extensor_strands(
     )
 
 
-def _released_strands(
-    method: "PatellaMethod", geometries: Sequence[KneeGeometry]
+def released_strands(
+    heads: Sequence[str],
+    bundles: "Sequence[Ligament]",
+    paths: Sequence[Mapping[str, TautPath]],
+    equilibria: "Sequence[FoundPatella | None]",
 ) -> tuple[Strand, ...]:
-    """Return heads and ligaments of a released patella; hidden where it was not found."""
-    loads = [one.extensor.released if one.extensor else None for one in geometries]
+    """Return heads and ligaments of a released patella; hidden where it was not found.
+
+    Args:
+        heads: names of the heads.
+        bundles: ligaments with an end on the patella.
+        paths: for each frame, head -> its path; empty: not found.
+        equilibria: for each frame the patella; None: not found.
+    """
     result = []
-    for head in method.heads:
-        paths = [one.paths[head.name] if one and one.found else None for one in loads]
-        result.append(_tendon(head.name.replace("_", " "), paths, np.zeros(len(loads), bool)))
+    for head in heads:
+        lines = [one.get(head) for one in paths]
+        result.append(_tendon(head.replace("_", " "), lines, np.zeros(len(lines), bool)))
     hidden = dict.fromkeys(("femur", "tibia", "patella"), np.full((4, 4), np.nan))
-    equilibria = [one.found if one else None for one in loads]
     poses = {
         link: np.stack([each.poses[link] if each else hidden[link] for each in equilibria])
         for link in hidden
     }
-    for bundle in method.carried:
+    for bundle in bundles:
         points = bundle.points(poses)
         pulls = np.array([each.tensions[bundle.name] if each else 0.0 for each in equilibria])
         colours = np.broadcast_to(rgb(TENDON), points.shape).copy()

@@ -25,6 +25,7 @@ from tkamb.run.known_errors import NOT_MEASURED, ContactSituation, as_json, stat
 from tkamb.run.read_scene import SharedState, recording_of
 from tkamb.run.recording import Recording
 from tkamb.show.view.bench import KEPT_MODELS, MOST_THREADS, ROWS, Bench, BenchRequest
+from tkamb.show.view.bench_patella import BenchPatella, ShownPatella, patella_of
 from tkamb.show.view.bench_scene import write_bench
 from tkamb.studies.designs.design import DESIGN_FILE, load_design
 from tkamb.studies.designs.insert import Insert
@@ -104,6 +105,7 @@ class LiveAnswer:
         ligaments: name -> (n, 3) m, points along the ligament, insert frame.
         centres: side -> (3,) m, centre of pressure, insert frame.
         error: known error of the contact model for this contact, or "not measured: ...".
+        patella: the patella; None: the request has no tension of the quadriceps.
     """
 
     request: BenchRequest
@@ -117,6 +119,7 @@ class LiveAnswer:
     ligaments: dict[str, Array]
     centres: dict[str, Array]
     error: dict[str, Any] | str = NOT_MEASURED
+    patella: ShownPatella | None = None
 
     @property
     def failed(self) -> bool:
@@ -132,16 +135,20 @@ class LiveKnee:
     Args:
         session: folder for the files of this session; None: a new folder. It is removed with this
             object. A saved scene has copies of the meshes in it.
+        patella: released patella of a `tkamb.Knee`; None: that of the case, if it has one.
 
     Attributes:
         design: design of the insert; None if its mesh does not come from a parametric design.
     """
 
-    def __init__(self, case: Case, session: Path | None = None) -> None:
+    def __init__(
+        self, case: Case, session: Path | None = None, patella: BenchPatella | None = None
+    ) -> None:
         if case.scene.contact is None:
             raise InputError("has no [contact]", "scene", "tkamb live shows contact: add the table")
         if case.scene.patient.scale != 1.0:
             raise InputError("is scaled", "[patient] scale", "tkamb live needs scale = 1")
+        self.patella = patella or patella_of(case)
         self.case = _without_muscles(case)
         self.bench = Bench(self.case, recording_of(self.case, near=True).ligaments)
         self._session = session or Path(tempfile.mkdtemp(prefix="tkamb-live-"))
@@ -160,7 +167,9 @@ class LiveKnee:
         return contact_names()
 
     def recorded(self, frame: int) -> BenchRequest:
-        """Return the bench at a recorded frame, under one body weight.
+        """Return the bench at a recorded frame.
+
+        The load is one body weight, and so is the tension on a released patella.
 
         Raises:
             InputError: the motion has no such frame.
@@ -182,6 +191,7 @@ class LiveKnee:
             contact=table.model,
             resolution_mm=table.resolution_mm,
             thickness_mm=None if self.design is None else self.design.thickness,
+            quadriceps_N=None if self.patella is None else self.case.body_weight,
         )
 
     def overtake(self) -> int:
@@ -239,14 +249,29 @@ class LiveKnee:
 
         Raises:
             TkambError: a newer request has arrived.
-            InputError: the contact model or spacing does not exist.
+            InputError: the contact model or spacing does not exist, or a tension of the quadriceps
+                is given to a knee without a released patella.
         """
+        if request.quadriceps_N is not None and self.patella is None:
+            raise InputError("the knee has no released patella", "quadriceps_N", "leave it out")
         with self._computing:
             if number is not None and number != self._latest:
                 raise TkambError("overtaken")
             if from_rest:
                 self._before.pop(setting(request), None)
-            return self._compute(request)
+            answer = self._compute(request)
+            if self.patella is None or request.quadriceps_N is None or answer.failed:
+                return answer
+            if from_rest:
+                self.patella.forget()
+            patella = self.patella.at(request, answer.pose)
+            words = [*([] if answer.status == "ok" else [answer.status]), *patella.words]
+            return replace(
+                answer,
+                numbers=answer.numbers | patella.numbers,
+                status="; ".join(words) or "ok",
+                patella=patella,
+            )
 
     def save(self, request: BenchRequest, folder: Path) -> Path:
         """Write a scene for which `tkamb run` gives the same numbers; return its file.

@@ -16,6 +16,7 @@ from tkamb.geometry.flat_bottom import insert_placement
 from tkamb.geometry.frames import (
     KNEE_COORDINATES,
     SIDES,
+    Array,
     knee_coordinates,
     knee_pose,
 )
@@ -26,6 +27,7 @@ from tkamb.run.known_errors import NOT_MEASURED
 from tkamb.show.pages import asset, policy_sources, render
 from tkamb.show.style import SIDE_COLOURS
 from tkamb.show.view.bench import BenchRequest, still_motion
+from tkamb.show.view.bench_patella import BenchPatella
 from tkamb.show.view.bench_scene import write_knee
 from tkamb.show.view.drawing import (
     INSERT,
@@ -51,6 +53,8 @@ SCRIPTS = ("scene.js", "moving.js", "controls.js", "live.js")
 DEFAULT_FOLDER = Path("out") / "live"
 COARSE = ("foundation", 2.0)
 """Contact model and spacing (mm) that are used while a slider moves."""
+PATELLA_NODES = ("patella/patellar button", "patella/patella")
+"""Nodes of the page that have the pose of the patella."""
 STRAIN_LIMIT = 0.1
 """1: upper end of the colour scale of ligament strains."""
 SCALES_MPA = (5.0, 10.0, 20.0, 30.0, 50.0, 80.0, 120.0, 200.0, 500.0, 1000.0)
@@ -142,7 +146,9 @@ class LiveWindow:
         }
 
     def _packed(self, answer: LiveAnswer, saved: str | None = None) -> bytes:
+        button = None if answer.patella is None else answer.patella.map
         peak = float(answer.pressure.max(initial=0.0)) / MEGAPASCAL
+        peak = max(peak, 0.0 if button is None else button.peak)
         scale = next((top for top in SCALES_MPA if peak <= top), SCALES_MPA[-1])
         shown = PressureMap(
             answer.points,
@@ -151,14 +157,27 @@ class LiveWindow:
             answer.gap[None],
         )
         words = self._words(answer, scale) | {"saved": saved}
-        return packed_map(shown, scale, json.dumps(words, allow_nan=False))
+        return packed_map(shown, scale, json.dumps(words, allow_nan=False), button)
 
     def _words(self, answer: LiveAnswer, scale: float) -> dict[str, Any]:
         numbers = {name: x for name, x in answer.numbers.items() if math.isfinite(x)}
         forces = [numbers.get(f"{side}_force_N", 0.0) for side in SIDES]
         if sum(forces) > 0:
             numbers["medial_share"] = 100.0 * forces[0] / sum(forces)
-        finite = bool(np.isfinite(answer.pose).all())
+        strands = {
+            name: (
+                ends,
+                strain_colours(
+                    answer.numbers[f"ligament_{name}_strain_percent"] / 100.0, STRAIN_LIMIT
+                ),
+            )
+            for name, ends in answer.ligaments.items()
+        }
+        poses = {"femoral component/femoral component": answer.pose}
+        if answer.patella is not None:
+            strands |= {one.name: (one.points[0], one.colours[0]) for one in answer.patella.strands}
+            poses |= dict.fromkeys(PATELLA_NODES, answer.patella.pose)
+            poses["pressure map/button"] = answer.patella.button
         return {
             "status": answer.status,
             "request": asdict(answer.request),
@@ -167,15 +186,13 @@ class LiveWindow:
             "error": _error_words(answer.error),
             "scale_MPa": scale,
             "numbers": numbers,
-            "pose": answer.pose.T.ravel().tolist() if finite else None,
-            "ligaments": {
+            "poses": {name: _finite(pose.T) for name, pose in poses.items()},
+            "strands": {
                 name.replace("/", "-"): {
-                    "ends": ends.tolist(),
-                    "colour": strain_colours(
-                        answer.numbers[f"ligament_{name}_strain_percent"] / 100.0, STRAIN_LIMIT
-                    ).tolist(),
+                    "points": _finite(points),
+                    "colours": np.broadcast_to(colours, points.shape).ravel().tolist(),
                 }
-                for name, ends in answer.ligaments.items()
+                for name, (points, colours) in strands.items()
             },
             "centres": {
                 f"{side} centre": centre.tolist() for side, centre in answer.centres.items()
@@ -214,6 +231,7 @@ class LiveWindow:
         zeros = np.zeros((1, len(answer.points)))
         hidden = np.full((1, 3), np.nan)
         colour = np.tile(rgb(SLACK), (1, 1, 1))
+        patella = self.knee.patella
         return Drawing(
             title="on the bench",
             side=case.scene.patient.side,
@@ -227,6 +245,7 @@ class LiveWindow:
                 Solid("insert", "insert", case.insert, INSERT, 1.0, still),
                 Solid(*metal, recorded),
                 Solid(*ghost, recorded),
+                *(patella.solids() if patella else ()),
             ),
             strands=tuple(
                 Strand(
@@ -237,7 +256,8 @@ class LiveWindow:
                     1e-3,
                 )
                 for one in self.knee.bench.bundles
-            ),
+            )
+            + (patella.hidden.strands if patella else ()),
             arrows=(),
             markers=tuple(
                 Marker(f"{side} centre", "contact points", SIDE_COLOURS[side], hidden, 8e-4)
@@ -245,6 +265,7 @@ class LiveWindow:
             ),
             map=PressureMap(answer.points, answer.triangles, zeros, zeros + 1.0),
             strain_limit=STRAIN_LIMIT,
+            button_map=patella.hidden.map if patella else None,
         )
 
 
@@ -273,6 +294,7 @@ def live(
     frame: int = 0,
     contact: str | None = None,
     folder: str | Path | None = None,
+    quadriceps: float | None = None,
 ) -> ViewServer:
     """Start a page on which a user moves and loads a knee by hand (docs/live.md).
 
@@ -287,6 +309,7 @@ def live(
         frame: recorded frame at which the window opens.
         contact: contact model that replaces the scene's.
         folder: folder for saved scenes; None: out/live.
+        quadriceps: first value of the tension on a released patella, N; default: one body weight.
 
     Returns:
         The server, in a thread. Its address is `url`, and `close()` stops it.
@@ -296,7 +319,10 @@ def live(
             argument belongs to the other kind of source.
     """
     must_be(source, (str, os.PathLike, Knee), "live", "give a scene file, a folder or a tkamb.Knee")
-    server = _window_of(source, q, load, frame, contact, Path(folder or DEFAULT_FOLDER)).server()
+    window = _window_of(source, q, load, frame, contact, Path(folder or DEFAULT_FOLDER))
+    if quadriceps is not None:
+        window.start = BenchRequest.read(asdict(window.start) | {"quadriceps_N": quadriceps})
+    server = window.server()
     serve_in_background(server)
     return server
 
@@ -347,7 +373,13 @@ def bench_of_knee(knee: Knee, q: Any) -> LiveKnee:
     except InputError:
         shutil.rmtree(session, ignore_errors=True)
         raise
-    return LiveKnee(replace(case, motion=still_motion(coordinates)), session)
+    patella = None if knee.patella is None else BenchPatella(knee, np.atleast_2d(q), placement)
+    return LiveKnee(replace(case, motion=still_motion(coordinates)), session, patella)
+
+
+def _finite(values: Array) -> list[float] | None:
+    """Return an array as a flat list; None: it has a NaN, and the page hides the object."""
+    return values.ravel().tolist() if np.isfinite(values).all() else None
 
 
 def _error_words(error: dict[str, Any] | str) -> str:

@@ -196,11 +196,16 @@ def peak_pressure(drawings: Sequence[Drawing]) -> float:
     return max((one.peak for one in maps), default=0.0)
 
 
-def packed_map(pressure_map: PressureMap, peak: float, words: str) -> bytes:
-    """Return one pressure map on the scale of an open page, with its legend."""
+def packed_map(
+    pressure_map: PressureMap, peak: float, words: str, button: PressureMap | None = None
+) -> bytes:
+    """Return one pressure map on the scale of an open page, with its legend, and the button's."""
     block = Block()
+    maps = {"map": _map(block, pressure_map, peak)}
+    if button is not None:
+        maps["button_map"] = _map(block, button, peak)
     # Browser and server are on one machine, so speed matters more than size.
-    return block.compress({"map": _map(block, pressure_map, peak), "words": words}, 1)
+    return block.compress(maps | {"words": words}, 1)
 
 
 def packed_lattice(lines: Array) -> bytes:

@@ -48,6 +48,8 @@ class Show:
         self.runs = tuple(runs)
         self.frame, self.camera = self._check(frame, camera)
         self.drawings: tuple[Drawing, ...] = tuple(draw(run, progress, lattice) for run in runs)
+        if camera == "button" and self.drawings[0].button_map is None:
+            raise InputError("has no map of the patellar button", "camera", "choose another view")
         self.packed = pack(self.drawings)
         self.title = " | ".join(drawing.title for drawing in self.drawings)
 

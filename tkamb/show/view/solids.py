@@ -17,8 +17,10 @@ from tkamb.geometry.frames import MIRROR, Array, inverse, pose, transform
 from tkamb.geometry.surface import Surface
 from tkamb.io.recordings.polygon_files import read_vtp, read_vtp_values
 from tkamb.io.scene.case import Case
-from tkamb.knee.chain import ChainState
+from tkamb.knee.chain import Chain, ChainState
 from tkamb.knee.equations import KneeGeometry
+from tkamb.knee.extensor import ExtensorLines
+from tkamb.knee.knee import Knee
 from tkamb.run.maps import ContactMaps
 from tkamb.show.sections import WORN_NAME, wear_of_run
 from tkamb.show.style import BLACK
@@ -112,12 +114,13 @@ def solids(
     return tuple(result)
 
 
-def patella_solids(case: Case, poses: Array) -> tuple[Solid, ...]:
+def patella_solids(knee: Knee, poses: Array) -> tuple[Solid, ...]:
     """Return patella and button at poses (f, 4, 4) in the insert frame; () without a patella."""
-    if case.scene.patella is None or case.patella is None:
+    if knee.extensor_lines is None:
         return ()
-    button = Solid("patellar button", "patella", case.patella, BUTTON, 1.0, poses)
-    return (button, Solid("patella", "patella", _patella(case), BONE, 0.55, poses))
+    button = Solid("patellar button", "patella", knee.button, BUTTON, 1.0, poses)
+    bone = _patella(knee.extensor_lines, knee.chain)
+    return (button, Solid("patella", "patella", bone, BONE, 0.55, poses))
 
 
 def worn_insert(results: "Results", side: str) -> tuple[Solid, ...]:
@@ -184,11 +187,10 @@ def _shaft(end: Array, profile: tuple[tuple[float, float], ...], name: str) -> S
     return revolved(radii, length * at, name).moved(_turned([0.0, 0.0, 1.0], end))
 
 
-def _patella(case: Case) -> Surface:
+def _patella(lines: ExtensorLines, chain: Chain) -> Surface:
     """Return an ellipsoid from the tendon's insertion to the ligament's origin."""
-    assert case.patellar_ligament is not None
-    ends = (case.muscles[0].points[-1], case.patellar_ligament.proximal)
-    top, bottom = (transform(case.chain.link_in(end.link, "patella"), end.position) for end in ends)
+    ends = (lines.muscle.points[-1], lines.ligament.points[0])
+    top, bottom = (transform(chain.link_in(end.link, "patella"), end.position) for end in ends)
     radii = np.array([PATELLA_DEPTH, 0.5 * float(np.linalg.norm(top - bottom)), PATELLA_WIDTH])
     rotation = _turned([0.0, 1.0, 0.0], top - bottom)
     rotation[:3, 3] = 0.5 * (top + bottom)

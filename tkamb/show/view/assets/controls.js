@@ -10,6 +10,8 @@ const CAMERAS = {
     from: [-0.0004, 0.21, 0], at: [0, 0.012, 0],
     without: ["femoral component", "bones", "floor", "patella", "ligaments", "extensor lines", "forces"]},
   "whole leg": {from: [1.6, 0.35, -1.6], at: [-0.04, -0.01, 0], arrows: 2.5},
+  "button": {without: ["femoral component", "recorded pose", "insert", "worn insert", "bones", "floor",
+    "ligaments", "extensor lines", "muscles", "forces", "contact points", "load paths"]},
 };
 const KNEE = [0, 0.03, 0];
 const element = (id) => document.getElementById(id);
@@ -22,13 +24,23 @@ function made(tag, text, parent, attributes = {}) {
   return child;
 }
 
+const canLook = (name) => name !== "button" || Boolean(tkamb.views[0].button_map);
+
+// The pressed side of the patellar button, from where it faces at this moment.
+function beforeButton(mirrored) {
+  const {object} = tkamb.node("/tkamb/0/pressure map/button");
+  object.updateWorldMatrix(true, false);
+  const {elements} = object.matrixWorld, [x, y, z] = elements.slice(4, 7).map((part) => 0.3 * part);
+  return {at: elements.slice(12, 15), from: [x, y, mirrored * z]};
+}
+
 tkamb.look = function (name) {
-  const camera = CAMERAS[name], at = camera.at || KNEE;
   const mirrored = tkamb.views[0].side === "left" ? -1 : 1;
-  const {viewer} = tkamb;
+  const camera = {at: KNEE, ...CAMERAS[name], ...(name === "button" ? beforeButton(mirrored) : {})};
+  const {viewer} = tkamb, {at} = camera;
   const pane = element("pane"), shape = pane.offsetWidth / tkamb.views.length / pane.offsetHeight;
   // The window of one knee without bones shows it from nearer.
-  const near = camera.at ? 1 : tkamb.closeness || 1;
+  const near = CAMERAS[name].at ? 1 : tkamb.closeness || 1;
   const farther = near * Math.max(1, 0.8 / shape);
   viewer.controls.target.set(...at);
   viewer.camera.position.set(
@@ -39,6 +51,7 @@ tkamb.look = function (name) {
     const off = (camera.without || []).includes(layer) || tkamb.switchedOff.has(layer);
     tkamb.showLayer(layer, !off);
   }
+  for (const {mapMesh} of tkamb.views) if (mapMesh) mapMesh.visible = name !== "button";
   tkamb.camera = name;
   tkamb.arrowLength = tkamb.data.metres_per_body_weight * (camera.arrows || 1);
   showScale();
@@ -51,6 +64,7 @@ tkamb.look = function (name) {
 
 function addCameras() {
   Object.keys(CAMERAS).forEach((name, k) => {
+    if (!canLook(name)) return;
     const button = made("button", name, element("cameras"), {title: `key ${k + 1}`});
     button.addEventListener("click", () => tkamb.look(name));
   });
@@ -259,7 +273,7 @@ function addKeys() {
     else if (event.key === "t") {
       const {style} = tkamb.viewer.gui.domElement;
       style.display = style.display === "none" ? "" : "none";
-    } else if (camera) tkamb.look(camera);
+    } else if (camera && canLook(camera)) tkamb.look(camera);
     else return;
     event.preventDefault();
   });

@@ -7,7 +7,8 @@ const SLIDERS = {
   pose: [["frame", "recorded frame", 0, 0, 1], ["flexion_deg", "flexion, deg", -10, 150, 0.5],
     ["adduction_deg", "varus, deg", -8, 8, 0.05], ["axial_rotation_deg", "rotation, deg", -25, 25, 0.1],
     ["ap_mm", "AP, mm", -20, 20, 0.1], ["ml_mm", "ML, mm", -10, 10, 0.1],
-    ["load_N", "load, N", 0, 4000, 10], ["thickness_mm", "thickness, mm", 5, 20, 0.5]],
+    ["load_N", "load, N", 0, 4000, 10], ["quadriceps_N", "quadriceps, N", 0, 4000, 10],
+    ["thickness_mm", "thickness, mm", 5, 20, 0.5]],
   femoral: [["varus_deg", "varus, deg", -8, 8, 0.1], ["rotation_deg", "rotation, deg", -10, 10, 0.1],
     ["slope_deg", "flexion, deg", -10, 10, 0.1], ["ap_mm", "AP, mm", -8, 8, 0.1],
     ["ml_mm", "ML, mm", -8, 8, 0.1]],
@@ -21,6 +22,10 @@ const TOTALS = [["force_si_N", "contact force, N", 0], ["medial_share", "medial 
 const CONDYLE = [["force_N", "force, N", 0], ["peak_pressure_MPa", "peak, MPa", 1],
   ["mean_pressure_MPa", "mean, MPa", 1], ["area_mm2", "area, mm²", 0],
   ["cop_ap_mm", "centre AP, mm", 1], ["cop_ml_mm", "centre ML, mm", 1]];
+const PATELLA = [["patella_tilt_deg", "tilt to lateral, deg", 1], ["patella_shift_mm", "shift to lateral, mm", 1],
+  ["button_force_N", "contact force, N", 0], ["button_medial_force_N", "medial facet, N", 0],
+  ["button_lateral_force_N", "lateral facet, N", 0], ["button_peak_pressure_MPa", "peak, MPa", 1],
+  ["button_area_mm2", "area, mm²", 0]];
 const KEPT = [["flexion_deg", "flexion", 1], ["load_N", "load, N", 0], ["medial_share", "M share, %", 1],
   ["medial_peak_pressure_MPa", "M peak, MPa", 1], ["lateral_peak_pressure_MPa", "L peak, MPa", 1],
   ["medial_area_mm2", "M area, mm²", 0], ["lateral_area_mm2", "L area, mm²", 0]];
@@ -55,9 +60,9 @@ class Bench {
     this.showState();
   }
 
-  // One pose has no frames; a mesh without a design has no thickness.
+  // One pose has no frames, a mesh without a design no thickness, a plane patella no tension.
   applies(key) {
-    return key === "frame" ? this.frames > 1 : key !== "thickness_mm" || this.thickness_mm !== null;
+    return key === "frame" ? this.frames > 1 : this.start[key] !== null;
   }
 
   addChoices() {
@@ -241,15 +246,19 @@ class Bench {
     this.refused = "";
     element("status").hidden = answer.status === "ok";
     element("status").textContent = answer.status;
+    if (packed.button_map) tkamb.views[0].button_map.levels = packed.button_map.levels;
     this.drawMap(packed.map, answer);
-    const root = "/tkamb/0";
-    tkamb.viewer.set_transform(
-      tkamb.split(`${root}/femoral component/femoral component`), answer.pose);
+    for (const [name, pose] of Object.entries(answer.poses)) {
+      const path = `/tkamb/0/${name}`;
+      tkamb.node(path).object.visible = pose !== null;
+      if (pose) tkamb.viewer.set_transform(tkamb.split(path), pose);
+    }
     for (const tube of tkamb.views[0].tubes) {
-      const line = answer.ligaments[tube.strand.path.split("/").pop()];
+      const line = answer.strands[tube.strand.path.split("/").pop()];
       if (!line) continue;
-      tube.strand.points.set(line.ends.flat());
-      tube.strand.colours.set([...line.colour, ...line.colour]);
+      if (line.points) tube.strand.points.set(line.points);
+      else tube.strand.points.fill(NaN);
+      tube.strand.colours.set(line.colours);
       tube.shown = -1;
       tube.show(0);
     }
@@ -257,6 +266,7 @@ class Bench {
       marker.points.set(answer.centres[marker.path.split("/").pop()] || [NaN, NaN, NaN]);
       placeMarker(marker, 0);
     }
+    if (tkamb.camera === "button" && answer.poses["pressure map/button"]) tkamb.look("button");
     tkamb.viewer.set_dirty();
     if (!asked.coarse && !this.reference) this.reference = answer.numbers;
     this.showNumbers();
@@ -288,6 +298,8 @@ class Bench {
     this.fill("numbers", ["", "now", "± reference"], [...TOTALS, ...released].map(single));
     this.fill("condyles", ["", "medial", "± ref.", "lateral", "± ref."],
       CONDYLE.map(([name, ...rest]) => [[`medial_${name}`, `lateral_${name}`], ...rest]));
+    element("patella").hidden = this.start.quadriceps_N === null;
+    this.fill("patella", ["patella", "now", "± ref."], PATELLA.map(single));
     const bundles = Object.keys(numbers).filter((name) => name.endsWith("_strain_percent"))
       .map((name) => name.slice(9, -15));
     this.fill("ligaments", ["", "N", "± ref.", "strain, %", "± ref."], bundles.map((name) =>
@@ -387,9 +399,11 @@ class Bench {
     const of = (name, digits) => inWords(numbers[name], digits);
     const condyle = (side) => `${side} ${of(`${side}_force_N`, 0)} N, peak ` +
       `${of(`${side}_peak_pressure_MPa`, 1)} MPa, ${of(`${side}_area_mm2`, 0)} mm²`;
+    const patella = Object.keys(numbers).some((name) => name.startsWith("button_")) ?
+      [PATELLA.map(([name, words, digits]) => `${words}: ${of(name, digits)}`).join("; ")] : [];
     return [`${element("titles").textContent}: ${inWords(request.flexion_deg, 1)}° of flexion, load ` +
       `${inWords(request.load_N, 0)} N; ${label}`, `${condyle("medial")}; ${condyle("lateral")}`,
-      ...(status === "ok" ? [] : [status])];
+      ...patella, ...(status === "ok" ? [] : [status])];
   }
 }
 
