@@ -440,3 +440,8 @@ def test_command_line_and_page_have_the_same_cameras():
     text = files("tkamb.show.view").joinpath("assets", "controls.js").read_text(encoding="utf-8")
     block = text.split("const CAMERAS = {")[1].split("\n};")[0]
     assert tuple(re.findall(r'^  "([^"]+)":', block, re.MULTILINE)) == CAMERAS
+
+
+def test_the_view_of_the_button_needs_its_map():
+    with pytest.raises(InputError, match="no map of the patellar button"):
+        Show([open_run(shipped_run())], camera="button")

@@ -92,6 +92,20 @@ class BenchPatella:
         """Return patella and button in the patella's frame."""
         return patella_solids(self.knee, np.eye(4)[None])
 
+    def tubes(self) -> tuple[Strand, ...]:
+        """Return the strands of `hidden` with room for any path.
+
+        A path of a head has at most the corners of the outline, and each end twice.
+        """
+        rows = np.zeros(4 if self.method.outline is None else len(self.method.outline) + 4, int)
+        return (
+            tuple(
+                replace(one, points=one.points[:, rows], colours=one.colours[:, rows])
+                for one in self.hidden.strands[: len(self.method.heads)]
+            )
+            + self.hidden.strands[len(self.method.heads) :]
+        )
+
     def at(self, request: BenchRequest, pose: Array) -> ShownPatella:
         """Return the patella at pose_femoral_in_insert (4, 4) under the tension of a request."""
         try:
@@ -143,28 +157,10 @@ class BenchPatella:
             button_row(press) | patella_row(bundles, found),
             words,
             pose,
-            tuple(
-                self._placed(strand, self._most_points if k < len(heads) else 0)
-                for k, strand in enumerate(strands)
-            ),
+            tuple(replace(one, points=transform(self._placement, one.points)) for one in strands),
             PressureMap(self._state.points, self._state.triangles, pressure[None], gap[None]),
             button,
         )
-
-    @property
-    def _most_points(self) -> int:
-        """Largest number of points of a head: each corner of the outline, and both ends twice."""
-        return 3 if self.method.outline is None else len(self.method.outline) + 4
-
-    def _placed(self, strand: Strand, count: int) -> Strand:
-        """Return a strand in the insert frame of the bench, its end repeated up to `count` points.
-
-        The number of points of a tube on the page is fixed.
-        """
-        last = strand.points.shape[1] - 1
-        rows = np.minimum(np.arange(max(count, last + 1)), last)
-        points = transform(self._placement, strand.points[:, rows])
-        return replace(strand, points=points, colours=strand.colours[:, rows])
 
 
 def patella_of(case: Case) -> BenchPatella | None:

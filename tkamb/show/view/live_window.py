@@ -257,7 +257,7 @@ class LiveWindow:
                 )
                 for one in self.knee.bench.bundles
             )
-            + (patella.hidden.strands if patella else ()),
+            + (patella.tubes() if patella else ()),
             arrows=(),
             markers=tuple(
                 Marker(f"{side} centre", "contact points", SIDE_COLOURS[side], hidden, 8e-4)

@@ -30,23 +30,30 @@ const canLook = (name) => name !== "button" || Boolean(tkamb.views[0].button_map
 function beforeButton(mirrored) {
   const {object} = tkamb.node("/tkamb/0/pressure map/button");
   object.updateWorldMatrix(true, false);
-  const {elements} = object.matrixWorld, [x, y, z] = elements.slice(4, 7).map((part) => 0.3 * part);
+  const {elements} = object.matrixWorld, [x, y, z] = elements.slice(4, 7).map((part) => 0.24 * part);
   return {at: elements.slice(12, 15), from: [x, y, mirrored * z]};
 }
 
-tkamb.look = function (name) {
-  const mirrored = tkamb.views[0].side === "left" ? -1 : 1;
-  const camera = {at: KNEE, ...CAMERAS[name], ...(name === "button" ? beforeButton(mirrored) : {})};
-  const {viewer} = tkamb, {at} = camera;
+tkamb.aim = function (name) {
+  const {viewer} = tkamb, mirrored = tkamb.views[0].side === "left" ? -1 : 1;
+  const camera = name === "button" ? beforeButton(mirrored) : CAMERAS[name], at = camera.at || KNEE;
   const pane = element("pane"), shape = pane.offsetWidth / tkamb.views.length / pane.offsetHeight;
   // The window of one knee without bones shows it from nearer.
-  const near = CAMERAS[name].at ? 1 : tkamb.closeness || 1;
+  const near = camera.at ? 1 : tkamb.closeness || 1;
   const farther = near * Math.max(1, 0.8 / shape);
   viewer.controls.target.set(...at);
   viewer.camera.position.set(
     at[0] + farther * camera.from[0],
     at[1] + farther * camera.from[1],
     at[2] + farther * mirrored * camera.from[2]);
+};
+
+// The button moves with the knee, and so does the camera before it.
+tkamb.follow = () => tkamb.camera === "button" && tkamb.aim("button");
+
+tkamb.look = function (name) {
+  const camera = CAMERAS[name];
+  tkamb.aim(name);
   for (const layer of tkamb.data.layers) {
     const off = (camera.without || []).includes(layer) || tkamb.switchedOff.has(layer);
     tkamb.showLayer(layer, !off);
@@ -223,6 +230,7 @@ function inBodyWeights(arrow, frame, weight) {
 
 tkamb.go = function (frame) {
   tkamb.showFrame(frame);
+  tkamb.follow();
   showNumbers();
   tkamb.live && tkamb.live.frameChanged();
 };

@@ -256,9 +256,9 @@ class Bench {
     for (const tube of tkamb.views[0].tubes) {
       const line = answer.strands[tube.strand.path.split("/").pop()];
       if (!line) continue;
-      if (line.points) tube.strand.points.set(line.points);
-      else tube.strand.points.fill(NaN);
+      tube.strand.points.set(line.points || [NaN]);
       tube.strand.colours.set(line.colours);
+      tube.strand.used = line.colours.length / 3;
       tube.shown = -1;
       tube.show(0);
     }
@@ -266,7 +266,7 @@ class Bench {
       marker.points.set(answer.centres[marker.path.split("/").pop()] || [NaN, NaN, NaN]);
       placeMarker(marker, 0);
     }
-    if (tkamb.camera === "button" && answer.poses["pressure map/button"]) tkamb.look("button");
+    tkamb.follow();
     tkamb.viewer.set_dirty();
     if (!asked.coarse && !this.reference) this.reference = answer.numbers;
     this.showNumbers();

@@ -1,7 +1,8 @@
 "use strict";
 // What moves: tubes, arrows and the frame that they show.
 
-// A tube of fixed topology along m points, whose places and colours are set for each frame.
+// A tube of fixed topology along m points, whose places and colours are set for each frame. Of the
+// points only the first `used` are drawn.
 class Tube {
   constructor(viewer, strand) {
     const {THREE} = MeshCat, count = strand.count;
@@ -30,14 +31,16 @@ class Tube {
 
   show(frame) {
     const {strand} = this, k = Math.min(frame, strand.frames - 1), n = 3 * strand.count;
+    const count = strand.used || strand.count;
     if (k === this.shown) return;
     this.shown = k;
-    const points = strand.points.subarray(k * n, (k + 1) * n);
+    const points = strand.points.subarray(k * n, k * n + 3 * count);
     this.node.visible = points.every(Number.isFinite);
     if (!this.node.visible) return;
     const colours = strand.colours.subarray(k * n, (k + 1) * n);
     const {position, normal, color} = this.geometry.attributes;
-    ringFrames(points, strand.count, (ring, at, across, over) => {
+    this.geometry.setDrawRange(0, 6 * SIDES * (count - 1));
+    ringFrames(points, count, (ring, at, across, over) => {
       for (let side = 0; side < SIDES; side++) {
         const angle = 2 * Math.PI * side / SIDES, c = Math.cos(angle), s = Math.sin(angle);
         for (let axis = 0; axis < 3; axis++) {
