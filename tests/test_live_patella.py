@@ -214,6 +214,14 @@ def test_the_patella_changes_no_number_of_the_knee(live, tmp_path):
     assert not any(name.startswith("button") for name in results.columns)
 
 
+def test_configurations_without_a_patella_are_refused(source):
+    knee, motion = source
+    q = motion.q[60].copy()
+    q[list(knee.anatomy.patella_q)] = np.nan
+    with pytest.raises(InputError, match="no pose of the patella"):
+        bench_of_knee(knee, q)
+
+
 def unpacked(packed):
     """Return the words of a packed answer, and the levels of the button's map."""
     content = gzip.decompress(packed)

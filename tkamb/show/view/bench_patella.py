@@ -3,7 +3,8 @@
 The femur has the pose of the pressed knee. The patella does not change this pose, because the bench
 prescribes the load of the contact. If the user moves a component on its bone, the button presses on
 the moved component, and the patella's joint, the origins of the heads and the ends of the ligaments
-stay with the bones.
+stay with the bones. The outline that the heads wrap and the plane between the button's facets move
+with the component.
 """
 
 from collections.abc import Mapping, Sequence
@@ -123,7 +124,7 @@ class BenchPatella:
             raise ComputationError("slack, because the quadriceps does not pull")
         flexion = knee_coordinates(pose)[FLEXION]
         nearest = min(self._recorded, key=lambda one: abs(one.coordinates[FLEXION] - flexion))
-        body, found = find_at(
+        body, patella = find_at(
             self.knee,
             KneePose(pose, nearest.patella),
             self.method.head_tensions(request.quadriceps_N),
@@ -131,30 +132,30 @@ class BenchPatella:
             self._data,
             request.bones(self.knee.chain.insert_in_tibia @ inverse(self._placement)),
         )
-        if found.press is None:
-            raise ComputationError(found.problem.removeprefix("patella: "))
-        if not any(found.tensions[one.name] for one in body.lines if "tibia" in one.links):
+        if patella.press is None:
+            raise ComputationError(patella.problem.removeprefix("patella: "))
+        if not any(patella.tensions[one.name] for one in body.lines if "tibia" in one.links):
             raise ComputationError("no ligament to the tibia is taut")
-        return self._shown(found, body.lines, body.head_paths(found.balance.coordinates))
+        return self._shown(patella, body.lines, body.head_paths(patella.balance.coordinates))
 
     def _shown(
         self,
-        found: FoundPatella | None,
+        patella: FoundPatella | None,
         bundles: Sequence[Ligament],
         paths: Mapping[str, TautPath],
     ) -> ShownPatella:
         heads = [head.name for head in self.method.heads]
-        strands = released_strands(heads, bundles, [paths], [found])
-        press = None if found is None else found.press
+        strands = released_strands(heads, bundles, [paths], [patella])
+        press = None if patella is None else patella.press
         count = len(self._state.points)
         pressure, gap, pose, button = np.zeros(count), np.ones(count), HIDDEN, HIDDEN
         words: tuple[str, ...] = ()
-        if found is not None and press is not None and press.contact is not None:
+        if patella is not None and press is not None and press.contact is not None:
             pressure, gap = press.contact.pressure / MEGAPASCAL, press.contact.gap
-            pose = self._placement @ found.poses["patella"]
-            button, words = self._placement @ press.pose, (*found.flags, *press.flags)
+            pose = self._placement @ patella.poses["patella"]
+            button, words = self._placement @ press.pose, (*patella.flags, *press.flags)
         return ShownPatella(
-            button_row(press) | patella_row(bundles, found),
+            button_row(press) | patella_row(bundles, patella),
             words,
             pose,
             tuple(replace(one, points=transform(self._placement, one.points)) for one in strands),
