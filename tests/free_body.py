@@ -26,6 +26,8 @@ class Lent:
         others: further muscles from shank to thigh: start (3,) in the tibia link, end (3,) in the
             femur link, tension, N.
         reserve: reserve moment on the shank about insert z, N·m.
+        wrapped: ligament that wraps -> its length, m, and the ends (3,), (3,) of its part between
+            femur and tibia.
     """
 
     condyles: dict
@@ -36,6 +38,7 @@ class Lent:
     patellofemoral: tuple
     others: list = field(default_factory=list)
     reserve: float = 0.0
+    wrapped: dict = field(default_factory=dict)
 
 
 class FreeBodies:
@@ -51,7 +54,10 @@ class FreeBodies:
         self.leg, self.t, self.lent = leg, t, lent
         insert = leg.insert_in_laboratory(t)
         self.axes, self.origin = insert[:3, :3], insert[:3, 3]
-        self.strands = leg.ligaments(t)
+        wrapped = {
+            name: (length, *map(self._to, ends)) for name, (length, *ends) in lent.wrapped.items()
+        }
+        self.strands = leg.ligaments(t, wrapped)
 
     def loads(self):
         """Return the unknowns by name, N and N·m, insert axes.

@@ -233,15 +233,21 @@ class Leg:
         near = (stamps > self.time[0] - MARGIN) & (stamps < self.time[-1] + MARGIN)
         return smoothed(stamps[near], wrench[near], table["cutoff_Hz"])
 
-    def ligaments(self, t):
-        """Return (tension, proximal point, distal point) of each bundle, laboratory frame."""
+    def ligaments(self, t, wrapped):
+        """Return (tension, proximal point, distal point) of each bundle, laboratory frame.
+
+        `wrapped` is name -> length, m, and ends of the part between the links.
+        """
         links = {b[end]["link"] for b in self.scene["ligament"] for end in ("proximal", "distal")}
         poses = {link: self.in_laboratory(link, t) for link in links}
         result = []
         for bundle in self.scene["ligament"]:
             tables = (bundle["proximal"], bundle["distal"])
             ends = [carry(poses[table["link"]], table["point_mm"]) for table in tables]
-            result.append((tension(bundle, np.linalg.norm(ends[1] - ends[0])), *ends))
+            length = np.linalg.norm(ends[1] - ends[0])
+            if "wrap" in bundle:
+                length, *ends = wrapped[bundle["name"]]
+            result.append((tension(bundle, length), *ends))
         return result
 
     def ends(self, line, t):

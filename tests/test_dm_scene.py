@@ -2,6 +2,7 @@
 
 import re
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,10 @@ from tkamb.io.recordings.tibia import load_tibia
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import Case, load_case
 from tkamb.knee.ligament_laws import QuadraticToe
+from tkamb.knee.ligament_paths import bundle_paths
 from tkamb.knee.ligaments import build_ligaments
 from tkamb.run.plausibility.movement import marker_questions
+from tkamb.run.read_scene import recording_of
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT.parent / "shared" / "data" / "dm"
@@ -226,6 +229,22 @@ def test_ligaments_are_near_their_slack_length_in_stance():
     for name in ("MCLs", "MCLd", "LCL"):
         assert np.abs(np.mean(bundles[name], axis=0)[STANCE]).max() < 0.08
     assert total[STANCE].max() < 0.5 * BODY_WEIGHT
+
+
+def test_the_superficial_mcl_passes_around_the_insert():
+    """Its straight lines would pass 2 to 3 mm through the medial rim."""
+    recording = recording_of(case())
+    strands = [one for one in recording.knee.ligaments if one.name.startswith("MCLs")]
+    insert = recording.knee.contact.pair.insert
+    assert len(strands) == 20
+    for frame in range(0, 61, 20):
+        state, share = recording.loads(frame).geometry.state, np.linspace(0.0, 1.0, 80)[:, None]
+        paths = bundle_paths(strands, {link: state.pose(link) for link in strands[0].links})
+        for points in paths.points:
+            parts = [a + share * (b - a) for a, b in pairwise(points)]
+            assert not insert.winding.inside(np.concatenate(parts)).any()
+            straight = points[0] + share * (points[-1] - points[0])
+            assert insert.winding.inside(straight).any()
 
 
 def test_hip_is_above_the_knee():

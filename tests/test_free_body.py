@@ -7,11 +7,12 @@ poses, the ground reaction as a wrench, ligament tensions, and the direction of 
 equations are in the laboratory: 6 for shank with foot, 3 for the patella, 6 for thigh with patella.
 
 tkamb supplies geometry: contact points and normals of condyles and patella, the lines of quadriceps
-and patellar ligament, unloaded condyles, and whether the quadriceps is slack. For DM it also
+and patellar ligament, taut paths of wrapped ligaments, unloaded condyles, and whether the quadriceps is slack. For DM it also
 supplies the pose of the insert's mesh and the solved positions of the patella. A line that wraps
 nothing is compared with the scene's two points.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from tkamb.geometry.frames import pose
 from tkamb.io.recordings.meshes import axes_rotation, load_surface
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
+from tkamb.knee.ligament_paths import bundle_paths
 from tkamb.run.muscles.shared_muscles import SharedMuscles
 from tkamb.run.read_scene import recording_of
 
@@ -83,13 +85,29 @@ def test_the_shipped_knee_with_muscles_across_it_is_in_balance(shipped, monkeypa
 @pytest.mark.parametrize("k", DM_FRAMES)
 def test_dm_is_in_balance_on_free_bodies(dm, k):
     leg, recording, time = dm
-    assert_same_loads(leg, recording.loads(k), time[k])
+    frame = recording.loads(k)
+    bundles = [bundle for bundle in recording.knee.ligaments if bundle.wraps]
+    wrapped = {bundle.name: lent_path(bundle, frame) for bundle in bundles}
+    assert len(wrapped) == 38
+    assert_same_loads(leg, frame, time[k], wrapped)
 
 
-def assert_same_loads(leg, frame, t):
+def lent_path(bundle, frame):
+    """Return the length of a wrapped ligament, m, and the ends of its part between the links."""
+    poses = {link: frame.geometry.state.pose(link) for link in bundle.links}
+    path = bundle_paths([bundle], poses)
+    points = path.points[0]
+    points = points[[True, *(np.diff(points, axis=0) != 0.0).any(axis=1)]]
+    (link,) = {wrap.body for wrap in bundle.wraps}
+    # The part on the surface belongs to the surface's link.
+    free = points[-2:] if link == bundle.proximal.link else points[:2]
+    return float(path.length[0]), *free
+
+
+def assert_same_loads(leg, frame, t, wrapped=None):
     """Assert that tkamb and the free bodies agree on every common load."""
     assert not frame.loads.problems
-    reference = FreeBodies(leg, t, lent(frame)).loads()
+    reference = FreeBodies(leg, t, replace(lent(frame), wrapped=wrapped or {})).loads()
     for k, axis in enumerate(("ap", "si", "ml")):
         reference[f"hip_force_{axis}"] = reference["hip_force"][k]
         reference[f"hip_moment_{axis}"] = reference["hip_moment"][k]

@@ -91,7 +91,7 @@ def import_patient(request: ImportRequest, folder: Path) -> ImportedPatient:
         bool(meshes and meshes.patella),
     )
     scale, mass_line = _mass_scale(request, leg)
-    tissue = soft_tissue(links, request.straight_ligaments)
+    tissue = soft_tissue(links)
     if meshes and meshes.femur_bone and not (tissue.quadriceps and tissue.patellar_ligament):
         hint = "leave it out, or complete the model"
         what = "is the bone that the quadriceps wraps, but the model has no quadriceps"

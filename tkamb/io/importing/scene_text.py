@@ -206,7 +206,6 @@ class ImportRequest:
         muscles: whether all muscles of the model share the load; otherwise only the quadriceps.
         cycle: times of 0 and 100 % of the gait cycle, s; "plates": two foot strikes on the plates.
         units: units that the user states because the file of the recording does not.
-        straight_ligaments: whether the surfaces that ligaments wrap are left out.
     """
 
     model: Path
@@ -236,4 +235,3 @@ class ImportRequest:
     muscles: bool = False
     cycle: tuple[float, float] | Literal["plates"] | None = None
     units: GivenUnits = field(default_factory=GivenUnits)
-    straight_ligaments: bool = False

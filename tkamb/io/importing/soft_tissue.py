@@ -52,16 +52,12 @@ class SoftTissue:
     remarks: tuple[str, ...]
 
 
-def soft_tissue(links: Links, straight_ligaments: bool = False) -> SoftTissue:
-    """Return the muscles and ligaments of a leg that the scene can describe.
-
-    Args:
-        straight_ligaments: whether the surfaces that ligaments wrap are left out.
-    """
+def soft_tissue(links: Links) -> SoftTissue:
+    """Return the muscles and ligaments of a leg that the scene can describe."""
     text: list[str] = []
     quadriceps = _quadriceps(links, text)
     ligament, length = _patellar_ligament(links, text)
-    bundles = _bundles(links, text, straight_ligaments)
+    bundles = _bundles(links, text)
     _name_muscles(links, text)
     return SoftTissue(quadriceps, ligament, length, bundles, tuple(text))
 
@@ -130,7 +126,7 @@ def _patellar_ligament(links: Links, remarks: list[str]) -> tuple[tuple[End, End
     return (ends[0], ends[1]), length
 
 
-def _bundles(links: Links, remarks: list[str], straight: bool) -> tuple[Bundle, ...]:
+def _bundles(links: Links, remarks: list[str]) -> tuple[Bundle, ...]:
     leg = links.leg
     bundles: list[Bundle] = []
     omitted: dict[str, list[str]] = {}
@@ -150,7 +146,7 @@ def _bundles(links: Links, remarks: list[str], straight: bool) -> tuple[Bundle, 
                 _end(tibia[-1]),
                 ligament.stiffness_N,
                 ligament.slack_length_m,
-                () if straight else _wraps(links, ligament, ignored),
+                _wraps(links, ligament, ignored),
             )
         )
     if bundles:
@@ -158,7 +154,6 @@ def _bundles(links: Links, remarks: list[str], straight: bool) -> tuple[Bundle, 
         remarks.append(
             f"{len(bundles)} femorotibial ligament strands imported, {wrapped} of them over "
             "surfaces of the model, the others as straight lines"
-            + (" (wraps on bone are left out)" if straight else "")
         )
     for reason, names in ignored.items():
         remarks.append(f"surfaces left out, {reason}: {some_names(names)}")
