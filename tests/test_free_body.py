@@ -7,9 +7,9 @@ poses, the ground reaction as a wrench, ligament tensions, and the direction of 
 equations are in the laboratory: 6 for shank with foot, 3 for the patella, 6 for thigh with patella.
 
 tkamb supplies geometry: contact points and normals of condyles and patella, the lines of quadriceps
-and patellar ligament, taut paths of wrapped ligaments, unloaded condyles, and whether the quadriceps is slack. For DM it also
-supplies the pose of the insert's mesh and the solved positions of the patella. A line that wraps
-nothing is compared with the scene's two points.
+and patellar ligament, taut paths of wrapped ligaments, unloaded condyles, and whether the
+quadriceps is slack. For DM it also supplies the pose of the insert's mesh and the solved positions
+of the patella. A line that wraps nothing is compared with the scene's two points.
 """
 
 from dataclasses import replace
