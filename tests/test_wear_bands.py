@@ -10,6 +10,7 @@ from scipy.stats import norm
 
 import shapes
 from interrupted_runs import broken_off
+from scenes import write_scene
 from tkamb.cli import main
 from tkamb.errors import InputError
 from tkamb.geometry.frames import KNEE_COORDINATES, knee_coordinates
@@ -20,6 +21,7 @@ from tkamb.studies.uncertainty.inputs import Draw, VariedInput
 from tkamb.studies.wear.bands import Sampling, check_samples, moved_case, varied_wear_inputs
 from tkamb.studies.wear.engine import ArticularSurface
 from tkamb.studies.wear.laws import Archard, LogarithmicCreep
+from tkamb.studies.wear.run import prepare_wear
 from tkamb.studies.wear.simulation import WearCase, simulate_wear
 from wear_bodies import DENSITY, MM, Pressed, always, ball_case, balls_scene, stroke, swing
 
@@ -167,6 +169,17 @@ def test_a_scene_with_uncertainty_has_bands_in_every_output(capsys, tmp_path):
     assert report["bands"]["standard_deviations"] == {"ml (mm)": 1.0, "wear_factor (relative)": 0.6}
     assert "loads" in report["bands"]["not_varied"]
     assert not (tmp_path / "out/.wear_samples").exists()
+
+
+@pytest.mark.parametrize("table", [None, {"wear_factor": 0.6}])
+def test_only_a_scene_with_uncertainty_has_bands_without_being_asked(tmp_path, table):
+    """A sample takes as long as the simulation, so that 32 are asked for."""
+    changes = {} if table is None else {"uncertainty": table}
+    scene = write_scene(tmp_path / "scene", contact__resolution_mm=4.0, **changes)
+    run = prepare_wear(scene, cycles=1000, updates=1, frames=2)
+    assert (0 if run.sampling is None else run.sampling.samples) == (32 if table else 0)
+    asked = prepare_wear(scene, cycles=1000, updates=1, frames=2, samples=20)
+    assert {one.name for one in asked.sampling.inputs} >= {"wear_factor", "ap", "adduction"}
 
 
 @pytest.mark.slow

@@ -240,7 +240,7 @@ def prepare_wear(
     if samples and inputs.part == "button":
         raise InputError("the button's wear has no bands", "--samples", "leave it out")
     if samples is None:
-        samples = WEAR_BAND.samples if inputs.uncertainty else 0
+        samples = WEAR_BAND.samples if inputs.has_uncertainty else 0
     sampling = Sampling.of(inputs, case, samples) if samples else None
     return WearRun(inputs, case, chosen_material, cycles, updates, sampling)
 

@@ -48,7 +48,9 @@ class WearSetup:
         files_sha256: SHA-256 of the files that the scene names.
         run_frames: start, stop and step of the frames of the run with the maps; None: the motion
             does not come from a folder of results.
-        uncertainty: table [uncertainty] of the scene; None: the scene has none.
+        uncertainty: table [uncertainty] of the scene, or its defaults; None: of the button, or of a
+            profile without the table.
+        has_uncertainty: whether the scene has this table.
         simulated: whether the motion is a simulator's profile.
         part: "insert", or "button": then "insert" in other names means the patellar button, in the
             button frame (`tkamb.knee.button`).
@@ -65,6 +67,7 @@ class WearSetup:
     files_sha256: str
     run_frames: tuple[int, ...] | None = None
     uncertainty: UncertaintyTable | None = None
+    has_uncertainty: bool = False
     simulated: bool = False
     part: str = "insert"
 
@@ -151,7 +154,7 @@ def wear_setup(
         spring_table = None if springs is None else read_springs(springs)
         motion = _of_profile(read_profile(simulator, frames), spring_table, engine, case, period)
     elif motion is None:
-        motion = _of_scene(case.scene, path, frames, progress)
+        motion = _of_scene(case, path, frames, progress)
     return WearSetup(
         engine=engine,
         articular=ArticularSurface.of_insert(case.insert, table.resolution_mm * MILLIMETRE),
@@ -164,6 +167,7 @@ def wear_setup(
         files_sha256=files_hash(case),
         run_frames=run_frames,
         uncertainty=uncertainty_of(case) if simulator is None else case.scene.uncertainty,
+        has_uncertainty=case.scene.uncertainty is not None,
         simulated=simulator is not None,
     )
 
@@ -277,20 +281,18 @@ def _of_profile(
     return CycleMotion(poses, profile.load, period, 1, tuple(notes), drive, seconds)
 
 
-def _of_scene(scene: Scene, path: Path, most: int, progress: Progress) -> CycleMotion:
+def _of_scene(case: Case, path: Path, most: int, progress: Progress) -> CycleMotion:
     """Run at most `most` frames of a scene, including the first and the last; return the cycle."""
-    case = load_case(scene)
-    recorded = case.motion.time
+    recorded, contact = case.motion.time, case.scene.contact
+    assert contact is not None
     count = len(recorded)
     chosen = [slice(part.start, part.stop, part.step) for part in chosen_frames(count, most)]
-    runs = [simulate(scene, frames=part, scene_path=path, progress=progress) for part in chosen]
+    runs = [simulate(case, frames=part, scene_path=path, progress=progress) for part in chosen]
     tracks = [_Track.of_maps(run.maps) for run in runs if run.maps is not None]
     track = _Track(*(np.concatenate(parts) for parts in zip(*tracks, strict=True)))
-    contact = scene.contact
-    assert contact is not None
     changed = contact.released or contact.adjust  # the computed poses differ from the recording
     whole = None if changed else (recorded, knee_pose(case.motion.coordinates))
-    return _cycle_of(track, range(len(track.time)), scene, recorded, whole)
+    return _cycle_of(track, range(len(track.time)), case.scene, recorded, whole)
 
 
 class _Track(NamedTuple):
