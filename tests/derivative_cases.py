@@ -79,38 +79,39 @@ def moved(values, model, q, v, k, size, by_v=False):
     return values(q, v + move) if by_v else values(pin.integrate(model, q, move), v)
 
 
-def one_sided(values, model, q, v, move):
-    """Return the changes along a move (nv,) of q by the one-sided derivatives of second order."""
-    here, found = values(q, v), []
+def one_sided(values, step):
+    """Return the changes over a step of values of a number by the one-sided second-order slopes."""
+    here, found = values(0.0), []
     for sign in (1.0, -1.0):
-        near, far = (values(pin.integrate(model, q, n * sign * move), v) for n in (1, 2))
+        near, far = (values(n * sign * step) for n in (1, 2))
         found.append(sign * (-3.0 * here + 4.0 * near - far) / 2.0)
     return found
 
 
-def kink_error(values, slope, model, q, v, unit, size, steps):
+def kink_error(values, slope, size, steps):
     """Return the error of a slope on its own side of a kink; None: there is no kink, or it misses.
 
     There is a kink if the one-sided differences by every step differ by more than `TOLERANCE`. On
     its own side the slope agrees with one of them within `TOLERANCE`.
 
     Args:
-        values: function of q and v.
-        slope: computed derivative along `unit`.
-        model: Pinocchio model.
-        q: configuration.
-        v: velocity.
-        unit: direction (nv,) of q, for a step of 1 m.
+        values: function of the distance along a direction.
+        slope: computed derivative by this distance.
         size: value to which errors are relative.
-        steps: steps, m; steps between and below them are tried, too.
+        steps: steps; steps between and below them are tried, too.
     """
     jumps, found = [], []
     for step in np.geomspace(0.1 * min(steps), max(steps), 5):
-        ahead, behind = (side / step for side in one_sided(values, model, q, v, step * unit))
+        ahead, behind = (side / step for side in one_sided(values, step))
         jumps.append(np.abs(ahead - behind).max() / size)
         found += [np.abs(slope - side).max() / size for side in (ahead, behind)]
     best = float(min(found))
     return best if min(jumps) > TOLERANCE and best < TOLERANCE else None
+
+
+def along(values, model, q, v, unit):
+    """Return values of q and v as a function of the distance along a direction (nv,) of q."""
+    return lambda distance: values(pin.integrate(model, q, distance * unit), v)
 
 
 def errors(computed, expected):
@@ -159,7 +160,8 @@ def agreement(values, computed, knee, q, v, steps=SHORT):
         if error > TOLERANCE:
             slope = computed[0][..., k] * units[k, k]
             relative = size[k] * units[k, k]
-            kink = kink_error(values, slope, knee.model, q, v, units[k], relative, steps)
+            line = along(values, knee.model, q, v, units[k])
+            kink = kink_error(line, slope, relative, steps)
         if kink is None:
             smooth.append(float(error))
         else:
@@ -189,7 +191,7 @@ def direction_agreement(values, computed, knee, q, v, steps=SHORT):
             found.append(np.abs(slope - change).max() / size)
         kink = None
         if min(found) > TOLERANCE and not by_v:
-            kink = kink_error(values, slope, model, q, v, scale * unit, size, steps)
+            kink = kink_error(along(values, model, q, v, scale * unit), slope, size, steps)
         if kink is None:
             smooth.append(float(min(found)))
         else:

@@ -284,14 +284,14 @@ def _with_released_patella(
     slopes: Loads,
 ) -> tuple[dict[str, Array], dict[str, Array]]:
     """Return the result of `_beside` with the loads of a released patella added."""
-    from tkamb.knee.patella_equilibrium import pulled_tibia, pulled_tibia_slope
+    from tkamb.knee.patella_equilibrium import PulledTibiaSlopes, pulled_tibia
 
     button = knee.button_contact
     assert knee.patella is not None and button is not None
     button.contact.check_differentiable()
-    wrench, body, coordinates, stiffness = pulled_tibia(knee, kinematics, heads, data)
-    slope = pulled_tibia_slope(body, coordinates, stiffness, knee.patella.released)
-    slope = slope @ _users(knee, twists.femur)
+    wrench, body, coordinates = pulled_tibia(knee, kinematics, heads, data)
+    slopes_of = PulledTibiaSlopes.of(body, coordinates, knee.patella.released)
+    slope = slopes_of.by_displacement() @ _users(knee, twists.femur)
     total, change = dict(beside), dict(slopes)
     for link, sign in (("tibia", 1.0), ("femur", -1.0)):
         total[link] = total.get(link, np.zeros(6)) + sign * wrench

@@ -708,7 +708,7 @@ class Knee(AssembledKnee):
         Raises:
             InputError: a coordinate is unknown, the knee has no contact model, the joints between
                 tibia and femur have too few degrees of freedom for the pose, or derivatives are
-                asked of a contact model without an exact tangent or with a released patella.
+                asked of a contact model without an exact tangent.
             ComputationError: the femur does not lie over the insert.
         """
         from tkamb.knee.pressed import contact_of_user
@@ -716,9 +716,8 @@ class Knee(AssembledKnee):
 
         contact, allowed = self._need_contact(), [n for n in KNEE_COORDINATES if n != "flexion"]
         released = names_among(released, allowed, "released", "coordinate")
-        if derivatives and self.patella is not None:
-            hint = "take differences, or a knee with a plane patella"
-            raise InputError("not with a released patella", "derivatives", hint)
+        if derivatives and self.button_contact is not None and self.patella is not None:
+            self.button_contact.contact.check_differentiable()
         data = self._data(data)
         instant = self._instant(q, v, a, fext, tensions, data)
         probe = data.probe if data.probe is not None else contact.probe()
@@ -764,7 +763,8 @@ class Knee(AssembledKnee):
         contact = model.with_exact_tangent(model.probe(), knee.contact)
         exact_tangent(contact, model.model.name)
         knee = replace(knee, contact=contact)
-        slopes = ImplicitEquilibrium(search, instant, knee, points).derivatives()
+        equations = ImplicitEquilibrium(search, instant, knee, points, self.ligaments)
+        slopes = equations.derivatives()
         if self.left:
             signs = self._coordinate_signs
             rows = np.append(signs, [1.0, 1.0])[:, None]

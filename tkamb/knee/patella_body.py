@@ -244,12 +244,17 @@ class PatellaBody:
         """Return w (6,), N and N·m; NaN where the contact model or a line has no result."""
         return self._loads(coordinates)[0]
 
-    def _loads(self, coordinates: Array) -> tuple[Array, Array | None, bool]:
-        """Return w (6,), K (6, 6) or None, and whether K is exact."""
+    def _loads(self, coordinates: Array, exact: bool = False) -> tuple[Array, Array | None, bool]:
+        """Return w (6,), K (6, 6) or None, and whether K is exact.
+
+        `exact` is whether the contact model computes its exact tangent, if it has one.
+        """
         place = self.femur_in_button(coordinates)
         contact, lost = self._probe.at(place), (np.full(6, np.nan), None, False)
         if not contact.known:
             return lost
+        if exact:
+            contact = self.button.contact.with_exact_tangent(self._probe, contact)
         try:
             heads = [head.loads(place, insertion) for head, insertion in self._heads]
             wrench = contact.wrench + self.bundles.wrench(place)
@@ -261,6 +266,32 @@ class PatellaBody:
             return wrench, None, False
         slopes = [load.stiffness for load in contact.loads] + [slope for _, slope in heads]
         return wrench, sum(slopes, tangent), bool(contact.exact)
+
+    def _trial(self, coordinates: Array, rows: list[int], exact: bool = False) -> Trial:
+        """Return the scaled generalised forces and their stiffness at coordinates (6,)."""
+        wrench, tangent, known = self._loads(coordinates, exact)
+        if not np.isfinite(wrench).all():
+            return Trial(np.full(len(rows), np.nan))
+        scale = SCALE[rows]
+        twists = self.twists(coordinates)[:, rows] / scale
+        if tangent is None:
+            return Trial(twists.T @ wrench)
+        turned = self._turned(coordinates, wrench)[np.ix_(rows, rows)] / np.outer(scale, scale)
+        return Trial(twists.T @ wrench, twists.T @ tangent @ twists - turned, known)
+
+    def exact_stiffness(self, coordinates: Array, released: Sequence[int]) -> Array:
+        """Return -dg/dc (n, n) of the n released coordinates, N/m, N and N·m.
+
+        Raises:
+            InputError: the contact model has no exact tangent.
+        """
+        rows = list(released)
+        trial = self._trial(coordinates, rows, exact=True)
+        if trial.stiffness is None or not trial.exact:
+            name = self.button.contact.model.name
+            what = f"contact model '{name}' has no exact tangent"
+            raise InputError(what, "derivatives", "take the foundation or a lattice for the button")
+        return np.asarray(trial.stiffness * np.outer(SCALE[rows], SCALE[rows]))
 
     def balance(
         self, start: Array, released: Sequence[int], size: float, near: bool = False
@@ -280,21 +311,9 @@ class PatellaBody:
             coordinates[rows] = x / SCALE[rows]
             return coordinates
 
-        def trial(x: Array) -> Trial:
-            coordinates = coordinates_at(x)
-            wrench, tangent, exact = self._loads(coordinates)
-            if not np.isfinite(wrench).all():
-                return Trial(np.full(len(rows), np.nan))
-            scale = SCALE[rows]
-            twists = self.twists(coordinates)[:, rows] / scale
-            if tangent is None:
-                return Trial(twists.T @ wrench)
-            turned = self._turned(coordinates, wrench)[np.ix_(rows, rows)] / np.outer(scale, scale)
-            return Trial(twists.T @ wrench, twists.T @ tangent @ twists - turned, exact)
-
         def once(x: Array) -> Trial:
             if x.tobytes() not in trials:
-                trials[x.tobytes()] = trial(x)
+                trials[x.tobytes()] = self._trial(coordinates_at(x), rows)
             return trials[x.tobytes()]
 
         def result(x: Array, last: Trial, stiffness: Array, problem: str = "") -> PatellaBalance:

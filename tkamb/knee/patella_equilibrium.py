@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import pinocchio as pin
@@ -26,7 +26,7 @@ from tkamb.knee.found_patella import (
 from tkamb.knee.ligaments import DISTAL, PROXIMAL, BundleArrays
 from tkamb.knee.load import LinkPoint, link_point, wrench_of, wrenches
 from tkamb.knee.muscles import off_femur
-from tkamb.knee.patella_body import SCALE, PatellaBody, patella_pose, released_numbers
+from tkamb.knee.patella_body import PatellaBody, patella_pose, released_numbers
 from tkamb.knee.patella_frame import HeadShare, PatellaMethod, tibial_wrench
 from tkamb.knee.pressed import KneePatellaResult, patella_of_user
 
@@ -305,7 +305,7 @@ def _link_wrenches(found: FoundPatella, body: PatellaBody) -> dict[str, Array]:
 
 def pulled_tibia(
     knee: "Knee", kinematics: KneePose, tensions: Mapping[str, float], data: "KneeData"
-) -> tuple[Array, PatellaBody, Array, Array]:
+) -> tuple[Array, PatellaBody, Array]:
     """Return the wrench (6,) of a released patella on the tibia, about the insert's origin.
 
     The wrench on the femur is opposite.
@@ -317,7 +317,7 @@ def pulled_tibia(
         data: data of the knee.
 
     Returns:
-        Wrench; forces on the patella; its coordinates (6,); stiffness (n, n) of its equilibrium.
+        Wrench; forces on the patella; its coordinates (6,).
 
     Raises:
         ComputationError: there is no equilibrium.
@@ -329,46 +329,79 @@ def pulled_tibia(
     if balance.problem:
         raise ComputationError(balance.problem.removeprefix("patella: "), "patella")
     data.patella_coordinates = balance.coordinates
-    wrench = tibial_wrench(body, balance.coordinates)
-    return wrench, body, balance.coordinates, balance.stiffness
+    return tibial_wrench(body, balance.coordinates), body, balance.coordinates
 
 
-def pulled_tibia_slope(
-    body: PatellaBody, coordinates: Array, stiffness: Array, released: Sequence[str]
-) -> Array:
-    """Return the derivative (6, 6) of `pulled_tibia` by a displacement of the femur.
+@dataclass(frozen=True, eq=False)
+class PulledTibiaSlopes:
+    """Derivatives of the wrench w of a released patella on the tibia, about the insert's origin.
 
-    The displacement xi of the femur against the insert carries the patella along, and the patella
-    moves by dc to its new equilibrium. With its generalised forces g, its stiffness K, and the
-    stiffness K_t of the ligaments to the tibia, all about the insert's origin,
+    A displacement xi of the femur against the insert carries the patella along, and the patella
+    moves by dc to its new equilibrium. Parameters of its lines change w by dw_p and the generalised
+    forces by dg_p at a fixed patella. With the stiffness K of the patella, and K_t of the ligaments
+    to the tibia about the insert's origin,
 
-        dw = K_t (xi + A dc),    K dc = dg = A^T (xi x* w - K_t xi),
+        dw = K_t (xi + A dc) + dw_p,    K dc = A^T (xi x* w - K_t xi) + dg_p,
 
-    where A dc is the displacement of the patella, and xi x* w turns the wrench w with the femur.
+    where A dc is the displacement of the patella, and xi x* w turns w with the femur.
 
     Args:
         body: forces on the patella.
         coordinates: its coordinates in equilibrium, shape (6,).
-        stiffness: stiffness of the equilibrium, shape (n, n).
-        released: names of the n released coordinates.
-
-    Raises:
-        InputError: a ligament from patella to tibia wraps the femur.
+        rows: numbers of the n released coordinates.
+        wrench: w, shape (6,).
+        tangent: K_t, shape (6, 6).
+        moves: A, shape (6, n).
+        response: K_t A K^-1, shape (6, n).
     """
-    if any({"femur", "tibia"} <= set(line.links) for line in body.lines):
-        where = "external_forces_derivatives"
-        raise InputError("a ligament from patella to tibia wraps the femur", where)
-    rows = list(released_numbers(released))
-    patella = body.patella(coordinates)
-    button = patella @ body.button.in_patella
-    placed = {"patella": (PROXIMAL, np.eye(4)), "tibia": (DISTAL, body.poses["tibia"])}
-    shank = [line.on_links(placed) for line in body.lines if "tibia" in line.links]
-    lines = BundleArrays.between(shank)
-    tangent, wrench = lines.tangent(patella), lines.wrench(patella)
-    turn = button[:3, :3]
-    to_insert = np.block([[turn, cross_matrix(button[:3, 3]) @ turn], [np.zeros((3, 3)), turn]])
-    moves = to_insert @ body.twists(coordinates)[:, rows]
-    forces = moves.T @ (force_cross(np.eye(6), wrench) - tangent)
-    scale = SCALE[rows]
-    change = np.linalg.solve(stiffness * np.outer(scale, scale), forces)
-    return np.asarray(tangent @ (np.eye(6) + moves @ change))
+
+    body: PatellaBody
+    coordinates: Array
+    rows: tuple[int, ...]
+    wrench: Array
+    tangent: Array
+    moves: Array
+    response: Array
+
+    @classmethod
+    def of(cls, body: PatellaBody, coordinates: Array, released: Sequence[str]) -> Self:
+        """Return the derivatives at an equilibrium.
+
+        Args:
+            body: forces on the patella.
+            coordinates: its coordinates in equilibrium, shape (6,).
+            released: names of the n released coordinates.
+
+        Raises:
+            InputError: a ligament from patella to tibia wraps the femur, or the contact model of
+                the button has no exact tangent.
+        """
+        if any({"femur", "tibia"} <= set(line.links) for line in body.lines):
+            where = "derivatives"
+            raise InputError("a ligament from patella to tibia wraps the femur", where)
+        rows = released_numbers(released)
+        patella = body.patella(coordinates)
+        button = patella @ body.button.in_patella
+        placed = {"patella": (PROXIMAL, np.eye(4)), "tibia": (DISTAL, body.poses["tibia"])}
+        shank = [line.on_links(placed) for line in body.lines if "tibia" in line.links]
+        lines = BundleArrays.between(shank)
+        tangent, wrench = lines.tangent(patella), lines.wrench(patella)
+        turn = button[:3, :3]
+        to_insert = np.block([[turn, cross_matrix(button[:3, 3]) @ turn], [np.zeros((3, 3)), turn]])
+        moves = to_insert @ body.twists(coordinates)[:, list(rows)]
+        stiffness = body.exact_stiffness(coordinates, rows)
+        response = tangent @ moves @ np.linalg.inv(stiffness)
+        return cls(body, coordinates, rows, wrench, tangent, moves, response)
+
+    def by_displacement(self) -> Array:
+        """Return the derivative (6, 6) by a displacement of the femur."""
+        forces = self.moves.T @ (force_cross(np.eye(6), self.wrench) - self.tangent)
+        return np.asarray(self.tangent + self.response @ forces)
+
+    def between(self, ahead: PatellaBody, behind: PatellaBody) -> Array:
+        """Return the change (6,) from one to another near body, whose heads and lines differ."""
+        at = self.coordinates
+        twists = self.body.twists(at)[:, list(self.rows)]
+        forces = twists.T @ (ahead.pull(at) - behind.pull(at))
+        change = tibial_wrench(ahead, at) - tibial_wrench(behind, at)
+        return np.asarray(change + self.response @ forces)

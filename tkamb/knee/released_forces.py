@@ -121,10 +121,14 @@ class JointEquilibrium:
     def contact_gain(self, coordinates: Array) -> Array:
         """Return d r / d w_contact (n, 6) at coordinates (6,)."""
         axes, columns = knee_axes(coordinates), self.columns(coordinates)
-        rows = axes[self._prescribed]
         # The projection subtracts the reactions that balance a contact wrench.
-        projection = np.eye(6) - columns @ np.linalg.solve(rows @ columns, rows)
+        projection = np.eye(6) + columns @ self.reaction_gain(coordinates)
         return np.asarray(-axes[list(self.released)] @ projection)
+
+    def reaction_gain(self, coordinates: Array) -> Array:
+        """Return d y / d w_contact (6 - n, 6) at coordinates (6,), flexion last."""
+        rows = knee_axes(coordinates)[self._prescribed]
+        return np.asarray(-np.linalg.solve(rows @ self.columns(coordinates), rows))
 
     def reactions_and_residual(self, coordinates: Array, contact: Array) -> tuple[Array, Array]:
         """Return y of `reactions`, and the residual wrench R (6,) on the insert."""

@@ -6,10 +6,12 @@ A solution x of r(x, p) = 0 depends on a parameter p by
 
 For a press, x is the height y of the femur, and r the difference of load and reaction; for an
 equilibrium, x are the released coordinates, and r the forces on them. The contact is not solved
-again: its exact tangent at the converged state gives its change. Patella and lines of the extensor
-mechanism are solved again at displaced poses, each from its neighbour.
+again: its exact tangent at the converged state gives its change. A plane patella and the lines of
+its mechanism are solved again at displaced poses, each from its neighbour. For a released patella
+the theorem holds, too: its stiffness in equilibrium gives its change.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -23,7 +25,10 @@ if TYPE_CHECKING:
     from tkamb.contact.model import ProbedContact
     from tkamb.contact.pair import ContactPair
     from tkamb.knee.instant import Instant
+    from tkamb.knee.ligaments import Ligament
+    from tkamb.knee.patella_frame import PatellaMethod
     from tkamb.knee.released import KneeEquilibrium, ReleasedKnee
+    from tkamb.knee.released_forces import JointEquilibrium
 
 PRESS_ROWS = ("medial_force", "lateral_force", "approach", "height")
 """Rows of `PressDerivatives`."""
@@ -127,8 +132,8 @@ class EquilibriumDerivatives:
             addition to `external`, in the insert frame.
         by_coordinate: by the knee coordinates that are not released, (8, 6), m and rad. The
             columns of released coordinates are zero.
-        by_slack_length: by the slack length of each ligament, (8, m), per m.
-        by_stiffness: by the stiffness of each ligament, (8, m), per unit of its law.
+        by_slack_length: by the slack length of each ligament of the knee, (8, m), per m.
+        by_stiffness: by the stiffness of each ligament of the knee, (8, m), per unit of its law.
     """
 
     by_load: Array
@@ -140,7 +145,16 @@ class EquilibriumDerivatives:
 class ImplicitEquilibrium:
     """The equations of an equilibrium near its solution, with a linear contact.
 
-    `points` are, by side, those where an unloaded condyle is nearest to the insert.
+    With a released patella the tension Q of the quadriceps is one more unknown, and the moment that
+    would have to hold flexion one more equation. The patella's wrench on the tibia is linear in the
+    displacement and in Q; its six coordinates have been eliminated (`PulledTibiaSlopes`).
+
+    Args:
+        search: the search that found the equilibrium.
+        instant: its instant.
+        knee: its result, with the exact tangent of the contact.
+        points: side -> point where an unloaded condyle is nearest to the insert.
+        ligaments: ligaments of the derivatives, with those of a released patella.
     """
 
     def __init__(
@@ -149,11 +163,21 @@ class ImplicitEquilibrium:
         instant: "Instant",
         knee: "KneeEquilibrium",
         points: dict[str, Array],
+        ligaments: "Sequence[Ligament]",
     ) -> None:
         self._search, self._instant, self._knee, self._points = search, instant, knee, points
-        here = [np.abs(self._forces(knee.coordinates, slack)).max() for slack in (False, True)]
-        # The search does not store whether the extensor mechanism was slack: the residual tells.
-        self._slack = bool(here[1] < here[0])
+        self._ligaments = ligaments
+        self._pull = _patella_pull(instant, knee)
+        self._slack = False
+        if self._pull is not None:
+            # The released patella replaces the mechanism of the plane patella.
+            self._instant = replace(instant, extensor=None, patella=None)
+        else:
+            here = [
+                np.abs(self._forces(knee.coordinates, slack=slack)).max() for slack in (False, True)
+            ]
+            # The search does not store whether the extensor mechanism was slack: residuals tell.
+            self._slack = bool(here[1] < here[0])
 
     def derivatives(self) -> EquilibriumDerivatives:
         """Return the derivatives."""
@@ -167,16 +191,19 @@ class ImplicitEquilibrium:
                 for move, size in zip(np.diag(sizes), sizes, strict=True)
             ]
         )
-        # The implicit function theorem: the released coordinates restore zero forces.
-        inverse = np.linalg.inv(by_coordinate[:, rows])
+        gain, unknowns = self._gain(), by_coordinate[:, rows]
+        if self._pull is not None:
+            unknowns = np.column_stack([unknowns, gain @ self._pull.by_tension()])
+        # The implicit function theorem: the unknowns restore zero forces.
+        inverse = np.linalg.inv(unknowns)[: len(rows)]
         held = [k for k in range(6) if k not in rows]
         held_columns = np.zeros((8, 6))
         held_columns[:, held] = self._rows(-inverse @ by_coordinate[:, held], np.eye(6)[:, held])
         return EquilibriumDerivatives(
-            self._rows(-inverse @ self._gain()),
+            self._rows(-inverse @ gain),
             held_columns,
-            self._rows(-inverse @ self._by_ligament("slack_length")),
-            self._rows(-inverse @ self._by_ligament("stiffness")),
+            self._rows(-inverse @ self._by_ligament("slack_length", gain)),
+            self._rows(-inverse @ self._by_ligament("stiffness", gain)),
         )
 
     def _rows(self, released: Array, held: Array | None = None) -> Array:
@@ -190,55 +217,136 @@ class ImplicitEquilibrium:
     def _slopes(self, ends: list[tuple[Array, Array, float]]) -> Array:
         """Return the slopes (n, m) of the forces between pairs of coordinates."""
         columns = [
-            (self._forces(ahead, self._slack) - self._forces(behind, self._slack)) / (2.0 * size)
+            (self._forces(ahead) - self._forces(behind)) / (2.0 * size)
             for ahead, behind, size in ends
         ]
         return np.array(columns).T
 
-    def _by_ligament(self, name: Literal["slack_length", "stiffness"]) -> Array:
-        """Return the slopes (n, m) of the forces by a parameter of each ligament."""
-        bundles, knee, columns = self._instant.ligaments, self._knee, []
-        for k, bundle in enumerate(bundles):
-            value, forces = getattr(bundle if name == "slack_length" else bundle.law, name), []
-            size = 1e-6 * value
+    def _by_ligament(self, name: Literal["slack_length", "stiffness"], gain: Array) -> Array:
+        """Return the slopes (n, m) of the forces by a parameter of each ligament.
+
+        Args:
+            gain: result of `_gain`.
+        """
+        columns, crossing = [], {bundle.name for bundle in self._instant.ligaments}
+        for bundle in self._ligaments:
+            value = getattr(bundle if name == "slack_length" else bundle.law, name)
+            size, ends = 1e-6 * value, []
             for sign in (1.0, -1.0):
                 if name == "slack_length":
-                    changed = replace(bundle, slack_length=value + sign * size)
+                    ends.append(replace(bundle, slack_length=value + sign * size))
                 else:
                     law = bundle.law.stiffened((value + sign * size) / value)
-                    changed = replace(bundle, law=law)
-                others = (*bundles[:k], changed, *bundles[k + 1 :])
-                instant = replace(self._instant, ligaments=others)
-                forces.append(self._forces(knee.coordinates, self._slack, instant))
-            columns.append((forces[0] - forces[1]) / (2.0 * size))
-        return (
-            np.array(columns).reshape(len(columns), -1).T
-            if columns
-            else np.zeros((len(self._search.released), 0))
-        )
+                    ends.append(replace(bundle, law=law))
+            if bundle.name in crossing:
+                ahead, behind = (self._forces(self._knee.coordinates, end) for end in ends)
+                columns.append((ahead - behind) / (2.0 * size))
+            elif self._pull is not None:
+                columns.append(gain @ self._pull.between(*ends) / (2.0 * size))
+            else:
+                columns.append(np.zeros(len(gain)))
+        return np.array(columns).reshape(len(columns), len(gain)).T
 
     def _gain(self) -> Array:
         """Return the slopes (n, 6) of the forces by a wrench on the tibia."""
-        joint, _ = self._joint(self._knee.coordinates, self._slack, self._instant)
-        return joint.contact_gain(self._knee.coordinates)
+        coordinates = self._knee.coordinates
+        joint, _ = self._joint(coordinates, self._slack, self._instant)
+        gain = joint.contact_gain(coordinates)
+        if self._pull is None:
+            return np.asarray(gain)
+        return np.vstack([gain, joint.reaction_gain(coordinates)[-1]])
 
-    def _forces(self, coordinates: Array, slack: bool, instant: "Instant | None" = None) -> Array:
-        """Return the forces (n,) on the released coordinates at displaced coordinates (6,)."""
-        instant = self._instant if instant is None else instant
+    def _forces(
+        self, coordinates: Array, changed: "Ligament | None" = None, slack: bool | None = None
+    ) -> Array:
+        """Return the forces (n,) on the released coordinates at displaced coordinates (6,).
+
+        With a released patella the moment that holds flexion is the last of them.
+
+        Args:
+            coordinates: knee coordinates, shape (6,).
+            changed: ligament that replaces that of its name.
+            slack: whether the extensor mechanism carries no load; None: as in the equilibrium.
+        """
+        instant, slack = self._instant, self._slack if slack is None else slack
+        if changed is not None:
+            others = (changed if one.name == changed.name else one for one in instant.ligaments)
+            instant = replace(instant, ligaments=tuple(others))
         joint, contact = self._joint(coordinates, slack, instant)
         forces = self._search.forces(instant, joint, coordinates, contact)
-        return joint.residual(coordinates, forces.wrench_at(coordinates, contact))
+        wrench = forces.wrench_at(coordinates, contact)
+        if self._pull is None:
+            return joint.residual(coordinates, wrench)
+        wrench = wrench + self._pull.wrench_after(self._displacement(coordinates))
+        moment = joint.reactions(coordinates, wrench)[-1]
+        return np.append(joint.residual(coordinates, wrench), moment)
 
     def _joint(
         self, coordinates: Array, slack: bool, instant: "Instant"
-    ) -> "tuple[Any, ProbedContact]":
+    ) -> "tuple[JointEquilibrium, ProbedContact]":
         knee, patella = self._knee, None
-        change = coordinates - knee.coordinates
-        contact = moved_contact(knee.contact, knee_axes(knee.coordinates).T @ change)
+        contact = moved_contact(knee.contact, self._displacement(coordinates))
         if instant.extensor is not None:
             patella = instant.extensor.patella(knee_pose(coordinates), knee.patella)
         geometry = instant.geometry(coordinates, patella)
         return self._search.joint_at(instant, geometry, contact, self._points, slack), contact
+
+    def _displacement(self, coordinates: Array) -> Array:
+        """Return the displacement (6,) of the femur to near coordinates (6,)."""
+        at = self._knee.coordinates
+        return np.asarray(knee_axes(at).T @ (coordinates - at))
+
+
+class _PatellaPull:
+    """The wrench of a released patella on the tibia near an equilibrium of the knee.
+
+    Args:
+        method: how the patella is found.
+        poses: link -> pose (4, 4) of femur and tibia in the insert frame.
+        tension: tension of the quadriceps, N.
+        coordinates: coordinates of the patella, shape (6,).
+    """
+
+    def __init__(
+        self, method: "PatellaMethod", poses: dict[str, Array], tension: float, coordinates: Array
+    ) -> None:
+        from tkamb.knee.patella_equilibrium import PulledTibiaSlopes
+
+        self._method, self._poses, self._tension = method, poses, tension
+        self._slopes = PulledTibiaSlopes.of(self._body(), coordinates, method.released)
+        self._by_displacement = self._slopes.by_displacement()
+
+    def _body(self, changed: "Ligament | None" = None, tension: float | None = None) -> Any:
+        """Return the forces on the patella with another ligament, or another tension, N."""
+        method = self._method
+        if changed is not None:
+            lines = (changed if one.name == changed.name else one for one in method.lines)
+            method = replace(method, lines=tuple(lines))
+        tensions = method.head_tensions(self._tension if tension is None else tension)
+        return method.body_of_heads(self._poses, tensions)
+
+    def wrench_after(self, displacement: Array) -> Array:
+        """Return the wrench (6,) after a small displacement (6,) of the femur."""
+        return np.asarray(self._slopes.wrench + self._by_displacement @ displacement)
+
+    def by_tension(self) -> Array:
+        """Return the derivative (6,) of the wrench by the tension; heads pull in proportion."""
+        ends = (self._body(tension=factor * self._tension) for factor in (1.5, 0.5))
+        return self._slopes.between(*ends) / self._tension
+
+    def between(self, ahead: "Ligament", behind: "Ligament") -> Array:
+        """Return the change (6,) of the wrench from one ligament to another of its name."""
+        return self._slopes.between(self._body(ahead), self._body(behind))
+
+
+def _patella_pull(instant: "Instant", knee: "KneeEquilibrium") -> _PatellaPull | None:
+    """Return the pull of a released patella in an equilibrium; None: no released patella pulls."""
+    extensor = knee.geometry.extensor
+    if instant.patella is None or extensor is None or extensor.released is None:
+        return None
+    state, released = knee.geometry.state, extensor.released
+    poses = {link: state.pose(link) for link in ("femur", "tibia")}
+    return _PatellaPull(instant.patella, poses, released.tension, released.coordinates)
 
 
 def moved_contact(contact: "ProbedContact", displacement: Array) -> "ProbedContact":
