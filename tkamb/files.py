@@ -1,10 +1,10 @@
 """Reading of files with size limits; writing of files that are never incomplete.
 
-Reading: only regular files up to a size limit are read. A FIFO would block for ever, a device has
-no end, and a table of gigabytes is not a recording. They are refused before a byte is read.
+Reading: only regular files up to a size limit are read, because a FIFO would block for ever, a
+device has no end, and a table of gigabytes is not a recording.
 
 Writing: a file is written under a temporary name in the same folder, then renamed, so that no link
-is followed. Files that belong together are all written first. Then a journal lists them, and they
+is followed. Files that belong together are all written first; then a journal lists them, and they
 are renamed. If the process is killed before the journal is written, the old files remain. If it is
 killed later, the next command that writes into the folder finishes the renames
 (`finish_replacement`). Readers change nothing.
@@ -48,21 +48,19 @@ BYTE_ORDER_MARKS = {
     codecs.BOM_UTF16_LE: "utf-16",
     codecs.BOM_UTF16_BE: "utf-16",
 }
-"""First bytes of a text file -> its encoding. Editors of Windows write them."""
+"""First bytes of a text file, which editors of Windows write -> its encoding."""
 
 SAVE_AS_UTF8 = "save it as UTF-8 text"
 
 HASH_LIMIT = 100_000 * MEGABYTE
-"""bytes: largest file for a SHA-256. Reading it takes five minutes."""
+"""bytes: largest file for a SHA-256, which takes five minutes."""
 
 
 def open_regular(path: str | Path, limit: float, *, what: str = "file", follow: bool = True) -> int:
     """Return a descriptor of a regular file of at most `limit` bytes, opened for reading.
 
     Args:
-        limit: largest size, bytes.
         what: kind of file, for messages.
-        follow: whether the path may be a symbolic link.
 
     Raises:
         InputError: the file does not exist, is not regular, is too large or cannot be opened.
@@ -85,7 +83,7 @@ def open_regular(path: str | Path, limit: float, *, what: str = "file", follow: 
 
 
 def check_readable(status: os.stat_result, path: str | Path, limit: float) -> None:
-    """Raise unless a file's status is that of a regular file of at most `limit` bytes.
+    """Raise unless a status is that of a regular file of at most `limit` bytes.
 
     Raises:
         InputError: the path is a folder, FIFO, device or socket, or the file is too large.
@@ -186,7 +184,7 @@ def parse_xml(content: bytes, path: str | Path, *, what: str = "file") -> Elemen
 
 
 def _xml_hint(content: bytes, parser: expat.XMLParserType) -> str:
-    """Return a hint for an error of the parser, from the bytes around the error."""
+    """Return a hint from the bytes around the parser's error."""
     position = max(parser.ErrorByteIndex, 0)
     near = content[max(position - 1, 0) : position + 12]
     if re.match(rb"<[\s\d=]", near):
@@ -201,7 +199,7 @@ def _xml_hint(content: bytes, parser: expat.XMLParserType) -> str:
 
 
 class _ShallowBuilder(TreeBuilder):
-    """Builds a tree of elements. It raises as soon as the elements are too deeply nested."""
+    """Raises as soon as the elements are too deeply nested."""
 
     def __init__(self, path: str | Path) -> None:
         super().__init__()
@@ -222,10 +220,7 @@ _NAMED = re.compile(rb'<\w+[^<>]*?\sfile="([^"<>]+)"')
 
 
 def named_files(path: Path) -> list[Path]:
-    """Return the files that an XML file names by file="…", and in turn the files that these name.
-
-    Args:
-        path: an OpenSim model. Its sets may be separate files.
+    """Return the files that an OpenSim model names by file="…", and in turn those that these name.
 
     Raises:
         InputError: as `read_bytes`.
@@ -253,9 +248,6 @@ def check_file(path: str | Path, limit: float, *, what: str = "file") -> None:
 
 def sha256_of(path: str | Path, limit: float = HASH_LIMIT) -> str:
     """Return the SHA-256 of a regular file's content, hexadecimal.
-
-    Args:
-        limit: largest size, bytes.
 
     Raises:
         InputError: the file does not exist, is too large or cannot be read.
@@ -298,21 +290,21 @@ OUTPUT_NAMES = frozenset(
         ),
     )
 )
-"""Names of the files that are replaced together. A journal can rename and remove no others."""
+"""Files that are replaced together; a journal can rename and remove no others."""
 TEMPORARY = re.compile(r"\.tkamb-[0-9a-f]{12}\.part")
 LONGEST_WAIT = 2.0
-"""s: time that a reader waits until a writer has moved its finished files into place, which takes
-milliseconds."""
+"""s: time that a reader waits for a writer to rename its finished files, which takes milliseconds.
+"""
 
 
 def temporary_path(folder: Path) -> Path:
-    """Return a new path for a temporary file in a folder."""
+    """Return a new temporary path in a folder."""
     return folder / f".tkamb-{secrets.token_hex(6)}.part"
 
 
 @contextmanager
 def replaced_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary path in the same folder. At the end its file replaces `path`.
+    """Yield a temporary path in the same folder, whose file replaces `path` at the end.
 
     When the block raises, `path` stays unchanged.
 
@@ -330,7 +322,7 @@ def replaced_file(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write `text` as UTF-8, completely or not at all.
+    """Write UTF-8, completely or not at all.
 
     Raises:
         InputError: the folder cannot be written.
@@ -340,7 +332,7 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_new_text(path: Path, text: str) -> None:
-    """Write `text` as UTF-8 into a new file, completely or not at all.
+    """Write a new file in UTF-8, completely or not at all.
 
     Raises:
         InputError: the name is in use, or the folder cannot be written.
@@ -358,7 +350,7 @@ def write_new_text(path: Path, text: str) -> None:
 
 
 def write_synced(path: Path, text: str) -> None:
-    """Write `text` as UTF-8 and flush it to the disk."""
+    """Write UTF-8 and flush it to the disk."""
     # A file name that is not UTF-8 contains lone surrogates, which UTF-8 cannot encode. "\udcff" is
     # written as these six characters, which JSON reads as the same name.
     with open(path, "w", encoding="utf-8", errors="backslashreplace") as file:
@@ -368,7 +360,7 @@ def write_synced(path: Path, text: str) -> None:
 
 
 def write_rows(path: Path, rows: Iterable[Iterable[object]]) -> None:
-    """Write rows of cells as CSV, one after the other, and flush them to the disk. NaN is empty."""
+    """Write rows of cells as CSV, and flush them to the disk; NaN is empty."""
     with open(path, "w", encoding="utf-8", errors="backslashreplace", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows(
             ["" if cell != cell else cell for cell in row] for row in rows
@@ -378,11 +370,7 @@ def write_rows(path: Path, rows: Iterable[Iterable[object]]) -> None:
 
 
 class Replacement:
-    """Files of one folder that are replaced together.
-
-    Args:
-        folder: an existing folder.
-    """
+    """Files of one existing folder that are replaced together."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -390,16 +378,16 @@ class Replacement:
         self._removed: list[str] = []
 
     def path(self, name: str) -> Path:
-        """Return the temporary path for the new version of a file of `OUTPUT_NAMES`."""
+        """Return the temporary path of a file of `OUTPUT_NAMES`."""
         assert name in OUTPUT_NAMES
         return self._written.setdefault(name, temporary_path(self.folder))
 
     def current(self, name: str) -> Path:
-        """Return the path of the new version of a file, or of the old one if there is no new."""
+        """Return the path of the new version, or of the old one if there is no new."""
         return self._written.get(name, self.folder / name)
 
     def remove(self, name: str) -> None:
-        """Remove the file of this name on `commit`, if it exists."""
+        """Remove the file on `commit`, if it exists."""
         self._removed.append(name)
 
     def commit(self) -> None:
@@ -442,7 +430,7 @@ def replacement_pending(folder: Path) -> bool:
 
 
 def check_replaced(folder: Path) -> None:
-    """Wait until a writer has moved its finished files into place. Nothing is written.
+    """Wait, without writing, until a writer has renamed its finished files.
 
     Raises:
         InputError: the writer was killed meanwhile.
@@ -457,9 +445,8 @@ def check_replaced(folder: Path) -> None:
 
 
 def finish_replacement(folder: Path) -> None:
-    """Rename the files that a folder's journal lists. Without a journal, do nothing.
-
-    The call can be repeated, but only by the process that has claimed the folder.
+    """Rename the files that a folder's journal lists, if there is one. The call can be repeated,
+    but only by the process that has claimed the folder.
 
     Raises:
         InputError: the journal is damaged, or the folder cannot be written.
@@ -490,8 +477,8 @@ def finish_replacement(folder: Path) -> None:
 def undamaged(path: str | Path, hint: str = "run it again") -> Iterator[None]:
     """Raise "is damaged: what" for any failure to read a file that tkamb wrote.
 
-    This is the boundary of all readers of results and kept work: inside, content is used as tkamb
-    writes it.
+    This is the boundary of all readers of results and kept work: inside, tkamb's own form is
+    assumed.
 
     Args:
         hint: what to do.
@@ -512,7 +499,7 @@ def undamaged(path: str | Path, hint: str = "run it again") -> Iterator[None]:
 
 
 def claim_directory(path: str | Path) -> Path:
-    """Make the output folder and check that a file can be written into it.
+    """Make the output folder and check that it can be written.
 
     Raises:
         InputError: the path is a file, or the folder cannot be made or written.
@@ -530,7 +517,7 @@ def claim_directory(path: str | Path) -> Path:
 
 
 def _remove(path: Path) -> None:
-    """Remove a file if possible. A failure is ignored, because its cause has been reported."""
+    """A failure is ignored, because its cause has been reported."""
     with suppress(OSError, ValueError):
         path.unlink(missing_ok=True)
 

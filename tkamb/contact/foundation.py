@@ -50,8 +50,7 @@ OVER_THE_EDGE = (
     "the femoral component reaches over the insert's edge, deeper than half of its thickness there"
 )
 WIDEST_EDGE = NEAR
-"""m: upper limit of the gaps in which `FoundationProbe.smoothed` counts a column partly: the change
-of the gap across it."""
+"""m: upper limit of the gaps in which `FoundationProbe.smoothed` counts a column partly."""
 SUMS = 70
 """Number of sums over the columns of one condyle; see `_add_up`."""
 
@@ -78,10 +77,10 @@ class ElasticFoundation(ContactModel):
 
     In the nonlinear law the column keeps its cross-section, so the true stress is p and the true
     strain eps is -ln(1 - d/h) (Blankevoort 1991). The polyethylene softens with pressure, as in Bei
-    & Fregly (2004): p = (M/E) E_s(p) eps, with the secant modulus E_s of the uniaxial curve at the
-    stress p. Since sigma = E_s(sigma) eps, p is the curve itself at (M/E) eps. A fully confined
-    column would hardly yield, but a contact patch of a knee is only as wide as the insert is thick.
-    With a linear material the law is Blankevoort's, p = -M ln(1 - d/h).
+    & Fregly (2004): p = (M/E) E_s(p) eps, with the secant modulus E_s at the stress p. Since sigma
+    = E_s(sigma) eps, p is the curve itself at (M/E) eps. A fully confined column would hardly
+    yield, but a contact patch of a knee is only as wide as the insert is thick. With a linear
+    material the law is Blankevoort's, p = -M ln(1 - d/h).
 
     Limits: neighbouring columns do not share load. The pressure therefore ends at the edge of the
     overlap, and peaks at rims are too high. The energy depends slightly on how the map points lie:
@@ -153,10 +152,10 @@ class ElasticFoundation(ContactModel):
     def press(
         self, state: SampledContact, load: float, pose: Array, guess: Guess | None = None
     ) -> ContactResult:
-        """Find the approach that carries `load` (N); see `ContactModel`.
+        """Find the approach that carries `load` (N), with the near columns alone; see
+        `ContactModel`.
 
-        Only near columns are evaluated. If all columns react differently at the end, the search is
-        repeated with all.
+        If all columns then react differently, the search is repeated with all.
         """
         nearby = _NearColumns(self.law, state, pose, guess)
         unloaded = -state.pair.femoral.curved.sag
@@ -169,10 +168,8 @@ class ElasticFoundation(ContactModel):
         return press_by_search(self, state, load, pose, guess, unloaded=unloaded)
 
     def _load_out_of_range(self, nearby: "_NearColumns", load: float) -> bool:
-        """Return whether all columns together go out of range before they carry the load.
-
-        The reaction rises with the approach, so one evaluation of all columns at the largest
-        approach in range gives the largest reaction.
+        """The reaction rises with the approach: all columns at the largest approach in range
+        decide.
         """
         if nearby.beyond - nearby.within > APPROACH_STEP:
             return False
@@ -197,7 +194,7 @@ class LinearFoundation(ElasticFoundation):
 
 
 class _NearColumns:
-    """The reaction of the columns near the femoral component.
+    """The reaction of the near columns.
 
     Attributes:
         within: m, largest evaluated approach that is in range; -inf if there is none.
@@ -211,7 +208,7 @@ class _NearColumns:
         self.within, self.beyond, self._last = -np.inf, np.inf, 0.0
 
     def reaction(self, approach: float) -> float:
-        """Return the reaction (N) at an approach (m); inf where the approach is out of range.
+        """Return the reaction (N) at an approach (m); inf where it is out of range.
 
         If `within` and `beyond` differ by at most `APPROACH_STEP`, it is that at `within` between
         them.
@@ -308,7 +305,7 @@ class FoundationProbe:
         return ProbedContact(condyles, known=not through, tangent=True)
 
     def seen(self, result: ContactResult, start: WarmStart | None = None) -> ProbedContact:
-        """Return the contact at the pose of a result, from the columns that it loads; see `at`."""
+        """Return the contact at the pose of a result, from its loaded columns; see `at`."""
         if not np.isnan(result.gap).any():
             self.around.take(result.pose, result.gap)
         return self.at(result.pose)
@@ -358,7 +355,7 @@ class FoundationProbe:
         return replace(contact, condyles=condyles)
 
     def loaded_points(self, pose: Array, contact: ProbedContact, slopes: bool) -> LoadedPoints:
-        """Return the pressures of the loaded columns; with `slopes` their derivative, too.
+        """Return the pressures of the loaded columns; with `slopes` their derivatives, too.
 
         A displacement changes the gap of a column by M . xi/c, and so its pressure p(d/h) by -p' M
         . xi/(c h).
@@ -418,10 +415,7 @@ def _add_up(
     """Sum the columns' forces, and their change as the femoral component moves.
 
     Args:
-        chosen: (m,) numbers of the columns.
-        area: (n,) m².
         gradients: (m, 3) normals of the femoral surface where the columns meet it, of any length.
-        patches: (m,) patches of the femoral surface.
         curvatures: (k, 3, 3) 1/m, of the patches: minus the derivative of `gradients` by the place
             on the femur, femoral frame.
         slope: (m,) Pa, derivative of `pressure` by the strain.

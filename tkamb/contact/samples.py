@@ -1,7 +1,6 @@
 """The insert's articular surface, sampled on a regular grid, and its gap to the femur.
 
-A column is the part of the insert below a map point, along the normal. `Neighbourhood` skips the
-columns that the femoral component cannot reach.
+A column is the part of the insert below a map point, along the normal.
 """
 
 from dataclasses import dataclass
@@ -26,8 +25,7 @@ class MapPointSettings:
     """The map points on the articular surface."""
 
     rim_rays: int = 8
-    """Number of rays along each edge of a map cell at the rim, which measure the cell's covered
-    share."""
+    """Rays along each edge of a map cell at the rim, which measure its covered share."""
     least_normal_y: float = 0.1
     """1: smallest superior component of a normal by which a covered area is divided; a slope of 84
     deg. It prevents a division by zero."""
@@ -42,8 +40,9 @@ class MapPointSettings:
     """Largest number of map cells over the bounding box: a knee's map with a spacing of about
     0.03 mm."""
     max_inner_walls: int = 8
-    """Largest number of inner walls behind which a ray along the normal is continued.
-    Inserts of several bodies have fewer."""
+    """Largest number of inner walls behind which a ray is continued. Inserts of several bodies have
+    fewer.
+    """
 
 
 MAP_POINT = MapPointSettings()
@@ -93,9 +92,6 @@ def sample_surface(insert: Surface, resolution: float) -> SurfaceSamples:
     are symmetric about x = 0 and z = 0. A wall parallel to y has no point. Integrals over the
     points are second-order in the resolution (midpoint rule). On two real implants the force at 1
     mm is within 0.5 %, the peak within 2 % and the area within 4 % of the values at 0.25 mm.
-
-    Args:
-        resolution: edge of the cells, m.
 
     Raises:
         InputError: the insert is not closed, or the resolution is too fine or too coarse for it.
@@ -159,7 +155,7 @@ def meet(samples: SurfaceSamples, femoral: Surface, pose: Array) -> Meeting:
 
 
 def body_of(femoral: Surface) -> Body:
-    """Return the arrays of the femoral component for the compiled loops."""
+    """Return the femoral component's arrays for the compiled loops."""
     return femoral.rays.tree, femoral.face_normals, femoral.curved.quadratics
 
 
@@ -234,7 +230,7 @@ def _from_outside(distance: float, face: int, along: Array, face_normals: Array)
 
 
 def _grid(insert: Surface, resolution: float) -> tuple[Array, tuple[int, int]]:
-    """Return the cell centres (n, 2), x and z, and the number of cells along x and z."""
+    """Return the cell centres (n, 2), x and z, and the cells along x and z."""
     # The cells are symmetric about the origin, so that a mirrored insert gets mirrored points.
     half = np.abs(insert.bounds[:, [0, 2]]).max(axis=0)
     count = np.maximum(np.ceil(half / resolution), 1)
@@ -252,7 +248,7 @@ def _grid(insert: Surface, resolution: float) -> tuple[Array, tuple[int, int]]:
 def _cells(
     caster: RayCaster, centres: Array, hit: Mask, resolution: float
 ) -> tuple[Array, Array, Index]:
-    """Return x and z of the point (n, 2), covered share (n,) and number (n,) of covered cells."""
+    """Return x and z of the point (n, 2), covered share (n,) and number (n,)."""
     around = [np.roll(np.pad(hit, 1), (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)]
     any_hit, all_hit = np.any(around, axis=0)[1:-1, 1:-1], np.all(around, axis=0)[1:-1, 1:-1]
     rim = np.flatnonzero(any_hit & ~all_hit)
@@ -290,9 +286,9 @@ def _above(surface: Surface, xz: Array) -> Array:
 
 
 def _through(caster: RayCaster, xz: Array, insert: Surface) -> tuple[Array, Index, Array]:
-    """Return the first crossings (n, 3) of vertical rays, their faces (n,) and thicknesses (n,), m.
+    """Return the first crossings (n, 3) of vertical rays, faces (n,) and thicknesses (n,), m.
 
-    The thickness ends where the ray finally leaves the insert: below an inner wall or a void the
+    The thickness ends where the ray finally leaves the insert: below inner walls and voids the
     material transmits the load, too.
     """
     origins = _above(insert, xz)
@@ -312,7 +308,7 @@ def _through(caster: RayCaster, xz: Array, insert: Surface) -> tuple[Array, Inde
 
 
 def _depth(caster: RayCaster, points: Array, normals: Array, thickness: Array) -> Array:
-    """Return the depth (n,), m, of the insert along the inward normals, through inner walls."""
+    """Return the depth (n,), m, along the inward normals, through inner walls."""
     depth = np.zeros(len(points))
     active = np.arange(len(points))
     for _ in range(MAP_POINT.max_inner_walls):
@@ -330,7 +326,7 @@ def _depth(caster: RayCaster, points: Array, normals: Array, thickness: Array) -
 
 
 def _grid_triangles(cell: Index, shape: tuple[int, int]) -> Index:
-    """Return the triangles (k, 3) between neighbouring points, facing +y."""
+    """Return triangles (k, 3) between neighbouring points, facing +y."""
     number = np.full(shape, -1)
     number.ravel()[cell] = np.arange(len(cell))
     a, b = number[:-1, :-1].ravel(), number[:-1, 1:].ravel()
@@ -357,7 +353,7 @@ none in 2,293 of them."""
 
 
 class Neighbourhood:
-    """Evaluates only the columns that the femoral component may reach.
+    """The columns that the femoral component may reach.
 
     A gap g at the last evaluation is now at least g - 2 m, with the displacement m of the femoral
     component at the column since then, if the angle between column and femoral normal is less than
@@ -372,12 +368,12 @@ class Neighbourhood:
         self.inputs = state.surface.columns, body_of(state.pair.femoral), memory
 
     def take(self, pose: Array, gap: Array) -> None:
-        """Store the gaps (n,) of all columns at a pose (4, 4)."""
+        """Store all columns' gaps (n,) at a pose (4, 4)."""
         np.minimum(gap, FARTHEST, out=self._gap)
         self._last_position[:] = transform(inverse(pose), self._bed.points)
 
     def at(self, pose: Array) -> tuple[Index, Meeting]:
-        """Return the near columns at a pose (4, 4), and where they meet the femoral surface."""
+        """Return the near columns, and where they meet the femoral surface."""
         steep = MAP_POINT.side_start_normal_y
         near, gap, gradient, patch = meet_nearby(*self.inputs, pose, steep)
         return near, Meeting(gap, gradient, patch)
@@ -389,7 +385,7 @@ def meet_nearby(
 ) -> tuple[Index, Array, Array, Index]:
     """Return the columns (m,) that the femoral component may reach, and the fields of `Meeting`.
 
-    `memory`, of all columns, is updated. `steep`: see `meet_columns`.
+    `memory`, of all columns, is updated; `steep`: see `meet_columns`.
     """
     points, (last_gap, last_position, places) = columns[0], memory
     near, number, place = np.empty(len(points), np.int64), 0, np.empty(3)
@@ -421,4 +417,5 @@ def meet_nearby(
 DOWN = np.array([0.0, -1.0, 0.0])
 DEEPEST = 0.5
 """1: largest penetration that can be measured, as a share of the thickness. Rays towards the femur
-start at this depth."""
+start there.
+"""

@@ -34,7 +34,7 @@ class HeightBound:
         y <= c + g . (x, z)      for every upward triangle over the cell
 
     g is the mean slope over the cell. On a slope the plane is closer to the surface than the
-    largest height of the cell. The grid covers the surface's extent in x and z.
+    largest height of the cell.
     """
 
     def __init__(self, surface: Surface) -> None:
@@ -45,7 +45,7 @@ class HeightBound:
         self._cells = self._cell_planes(surface)
 
     def over(self, points: Array) -> Array:
-        """Return a height (n,), m, that the surface over the points (n, 3) does not exceed."""
+        """Return a height (n,), m, that the surface over points (n, 3) does not exceed."""
         xz = points[:, [0, 2]]
         plane = self._cells[tuple(self._place(xz).T)]
         return np.einsum("ij,ij->i", plane[:, :2], xz) + plane[:, 2]
@@ -55,7 +55,7 @@ class HeightBound:
         return np.clip(index, 0, self._last)
 
     def _cell_planes(self, surface: Surface) -> Array:
-        """Return the plane of each cell, (i, j, 3): g along x and z, and c (m)."""
+        """Return each cell's plane, (i, j, 3): g along x and z, and c (m)."""
         faces = surface.faces[surface.face_normals[:, 1] > 0]
         triangles = surface.vertices[faces]
         a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
@@ -96,26 +96,27 @@ class ClosestPointSettings:
     """The search for the closest points of two surfaces."""
 
     region_radius: float = 1.6e-2
-    """m: largest distance of a point of the close region from the closest point. A
-    condyle's contact is smaller."""
+    """m: largest distance of a point of the close region from the closest point. A condyle's
+    contact is smaller.
+    """
     facing_cosine: float = 0.7
     """1: cosine of the angle between the surfaces above which they face each other.
     Surfaces at more than 45 deg do not touch face to face."""
     clearance: float = 1e-6
-    """m: a point that lies higher than this above the bound of the insert's height is outside the
-    insert. It is above the rounding of a mesh."""
+    """m: a point this much above the bound of the insert's height is outside. It is above the
+    rounding of a mesh.
+    """
     gap_range: float = 10 * CONDYLE.facet_depth
     """m: largest excess of a sample's gap over the smallest gap. The weight of a
     farther sample is below 5e-5."""
     rounds: int = 3
-    """Number of times that the triangles around the deepest point are divided into four. Larger:
-    slower, but a finer position of the point."""
+    """Number of times that the triangles around the deepest point are divided into four."""
     kept_candidates: int = 8
-    """Number of vertices or triangles with which the search of the deepest point continues.
-    The deepest point is among them."""
+    """Vertices or triangles with which the search of the deepest point continues. It is among them.
+    """
     batch_size: int = 64
-    """Number of vertices whose depth is computed together, and largest number of intersecting
-    triangles that are examined."""
+    """Vertices whose depth is computed together, and most intersecting triangles that are examined.
+    """
 
 
 CLOSEST_POINT = ClosestPointSettings()
@@ -128,8 +129,8 @@ class CondyleGap:
     Args:
         gap: m, distance of the closest points; for an overlap the depth of the deepest femoral
             point below the insert's surface, negative.
-        point_on_femoral: (3,) m, closest or deepest point of the femoral component.
-        point_on_insert: (3,) m, closest point of the insert.
+        point_on_femoral: (3,) m, closest or deepest.
+        point_on_insert: (3,) m, closest.
         centre: (3,) m, on the insert, centre of the close region (`_CloseRegion`).
         normal: (3,) unit, from the insert to the femur, mean of the insert's vertex normals over
             the close region.
@@ -144,7 +145,7 @@ class CondyleGap:
 
 @dataclass(frozen=True, eq=False)
 class CondyleGaps:
-    """The gaps of both condyles; `lateral` is None if the femoral component has one condyle."""
+    """The gaps of both condyles; `lateral` is None without a second condyle."""
 
     medial: CondyleGap
     lateral: CondyleGap | None
@@ -209,7 +210,7 @@ class ClosestPointQuery:
         return float(distance) * MILLIMETRE, on_femoral, on_insert
 
     def _touching(self, condyle: "_Condyle", pose: Array) -> Index:
-        """Return triangles that cut or touch the insert; else those at the nearest vertex."""
+        """Return triangles that touch the insert; else those at the nearest vertex."""
         request = fcl.CollisionRequest(
             num_max_contacts=CLOSEST_POINT.batch_size, enable_contact=True
         )
@@ -223,7 +224,7 @@ class ClosestPointQuery:
     def _deepest_vertices(self, condyle: "_Condyle", pose: Array) -> Index:
         """Return the `kept_candidates` deepest vertices inside the insert, deepest first.
 
-        The depth along y is an upper bound of the depth; vertices are evaluated in its order.
+        Vertices are evaluated in the order of the depth along y, an upper bound.
         """
         near, points = _within_box(condyle.points, pose, *self.insert.bounds)
         under = points[:, 1] < self._ceiling.over(points) + CLOSEST_POINT.clearance
@@ -240,13 +241,13 @@ class ClosestPointQuery:
         return condyle.vertices[near[order[np.argsort(-depth)[: CLOSEST_POINT.kept_candidates]]]]
 
     def _depth_along_y(self, points: Array) -> Array:
-        """Return the distance (n,), m, along +y to the insert's surface; 0 for points outside."""
+        """Return the distance (n,), m, along +y to the insert's surface; 0 outside."""
         distance, face = self.insert.rays.first(points, np.array([0.0, 1.0, 0.0]))
         inside = (face >= 0) & (self.insert.face_normals[face, 1] > 0)
         return np.where(inside, distance, 0.0)
 
     def _refined(self, faces: Index, pose: Array) -> tuple[float, Array, Array]:
-        """Return the gap (m) of the deepest point of triangles, the point, and its insert point."""
+        """Return gap (m), deepest point of triangles, and its insert point."""
         corners = self.femoral.triangles[faces]
         triangles = transform(pose, corners.reshape(-1, 3)).reshape(-1, 3, 3)
         _, first = np.unique(self.femoral.faces[faces], return_index=True)
@@ -293,7 +294,7 @@ class _Condyle:
 
 
 class _CloseRegion:
-    """Part of one body's surface, prepared to find the close region on another body.
+    """Finds the close region of another body for a part, `faces` (k,), of this one.
 
     On conforming surfaces the closest point of two meshes moves by millimetres from pose to pose,
     although the gap changes by a few micrometres. The centre of the close region moves smoothly:
@@ -301,10 +302,8 @@ class _CloseRegion:
         c = sum w_i p_i / sum w_i,   w_i = A_i exp(-(g_i - g) / d)
 
     Sample i has the area A_i, the signed gap g_i and the nearest point p_i on the other body; g is
-    the smallest gap and d the depth of a facet (`CONDYLE.facet_depth`). If the gap has a sharp
-    minimum, the centre is the closest point.
-
-    `faces` (k,) are the triangles of the part.
+    the smallest gap and d `CONDYLE.facet_depth`. If the gap has a sharp minimum, the centre is the
+    closest point.
     """
 
     def __init__(self, surface: Surface, faces: Index) -> None:
@@ -316,7 +315,7 @@ class _CloseRegion:
     def centre(
         self, other: NearestPoints, pose: Array, gap: float, closest: Array
     ) -> tuple[Array, Array]:
-        """Return centre (3,), m, and mean unit normal (3,) of the close region on the other body.
+        """Return centre (3,), m, and mean unit normal (3,) on the other body.
 
         Both are in the other body's frame, like `closest` (3,), m, this body's point with the
         smallest signed `gap` (m). `pose` (4, 4) is this body in the other body's frame.
@@ -342,7 +341,7 @@ class _CloseRegion:
 
 
 def _thinned(samples: Array, areas: Array) -> tuple[Index, Array]:
-    """Return one sample (m,) per cube of the sample spacing, and the area (m,) of its samples."""
+    """Return one sample (m,) per cube of the sample spacing, with its area (m,)."""
     cubes = np.floor(samples / CONDYLE.sample_spacing).astype(np.int64)
     cubes -= cubes.min(axis=0)
     number = np.ravel_multi_index(tuple(cubes.T), tuple(cubes.max(axis=0) + 1))
@@ -353,7 +352,7 @@ def _thinned(samples: Array, areas: Array) -> tuple[Index, Array]:
 
 
 def _tree(surface: Surface, faces: Index) -> fcl.BVHModel:
-    """Return the bounding-box tree of triangles for fcl, in millimetres.
+    """Return the fcl tree of triangles, in millimetres.
 
     fcl has absolute tolerances: in metres it reports contact of small triangles 30 µm apart.
     """
@@ -385,7 +384,7 @@ def _within_box(points: Array, pose: Array, low: Array, high: Array) -> tuple[In
 
 @compiled_as_written
 def _facing_alike(samples: Array, normals: Array, place: Array, radius: float) -> Index:
-    """Return the samples within `radius` (m) whose normals are within 60 deg of the nearest's."""
+    """Return the samples within `radius` (m) with normals within 60 deg of the nearest's."""
     square, nearest = np.empty(len(samples)), 0
     for i in range(len(samples)):
         x, y, z = samples[i, 0] - place[0], samples[i, 1] - place[1], samples[i, 2] - place[2]

@@ -24,23 +24,21 @@ class CondyleSettings:
     single condyle of a real component has notches up to 2.4 mm (components of the Grand Challenge
     subjects DM and JW, and of the shipped knee, cut in halves)."""
     extended_notch_depth: float = 0.5e-3
-    """m: smallest depth, at 0 deg of flexion, of the notch between two condyles. A
-    single long body has no notch there, although its ends may resemble condyles in flexion."""
+    """m: smallest depth, at 0 deg of flexion, of the notch between two condyles. A single long body
+    has none there, although its ends may resemble condyles in flexion.
+    """
     facet_depth: float = 3e-5
     """m: largest distance between a facet of 1 to 2 mm and the curved condyle that it approximates.
     Heights that differ by less count as equal."""
     strip_width: float = 1e-3
-    """m: width of the strips along z in which the notch is searched. A condyle is
-    wider."""
+    """m: width of the strips along z in which the notch is searched; a condyle is wider."""
     sample_spacing: float = 1e-3
     """m: spacing of the samples of a condyle's surface. About the size of a mesh's
     facets."""
     highest_sample: float = 10 * facet_depth
-    """m: height above the lowest vertex above which samples have no weight. Higher
-    samples are not in contact."""
+    """m: height above the lowest vertex above which samples have no weight."""
     samples_per_box: int = 32
-    """Number of samples of a surface in one box of the search. Chosen for speed; results do not
-    depend on it."""
+    """Samples in one box of the search: for speed only, results do not depend on it."""
     deepest_notch: float = 15e-3
     """m: upper limit of heights above the lowest point. Notches are 6 to 14 mm
     deep."""
@@ -76,7 +74,7 @@ _FLEXIONS = np.radians(np.arange(0.0, 121.0, 15.0))
 
 @dataclass(frozen=True)
 class YawSearch:
-    """Settings of the search for the line through both condyles in the horizontal plane.
+    """Search for the line through both condyles in the horizontal plane.
 
     Args:
         flexions: rad, over which the outline is averaged; `step`: rad; `spacing`, `strip`: m.
@@ -103,8 +101,7 @@ def condyle_split(femoral: Surface) -> float | None:
     flexions from 0 to 120 deg (about +z, as in `tkamb.geometry.frames`). Two condyles are two
     valleys of the outline. The ridge between them must rise at least 3 mm above both, or 2 mm if it
     exists in extension, too. The split is the middle of the ridge at half its height. A sphere, a
-    cylinder along z or a unicondylar component has one valley. In a right knee z above the split is
-    lateral.
+    cylinder along z or a unicondylar component has one valley.
 
     Args:
         femoral: femoral component, femoral frame (x anterior, y superior, z right).
@@ -134,13 +131,11 @@ def condyle_split(femoral: Surface) -> float | None:
 def condyle_yaw(femoral: Surface, search: YawSearch = YAW_SEARCH) -> tuple[float, float]:
     """Return the angle between z and the line through both condyles, and the depth of the notch.
 
-    The notch is searched along horizontal directions; it is deepest along the line through both
-    condyles. The angle is the mean over directions with more than half this depth, weighted by
-    depth.
+    The notch is deepest along the line through both condyles; the angle is the mean over horizontal
+    directions with more than half this depth, weighted by depth.
 
     Returns:
-        Angle about +y, rad, in (-90, 90] deg, and depth of the deepest notch, m. Without a notch
-        the angle has no meaning.
+        Angle about +y, rad, in (-90, 90] deg (without meaning if there is no notch), and depth, m.
     """
     samples = _samples(femoral, search.spacing)
     yaws = np.arange(-np.pi / 2, np.pi / 2 - search.step / 2, search.step)
@@ -161,7 +156,6 @@ def condyle_yaw(femoral: Surface, search: YawSearch = YAW_SEARCH) -> tuple[float
 
 
 def _check_yaw(femoral: Surface) -> None:
-    """Raise an InputError if the two condyles do not lie side by side along z."""
     yaw, notch = condyle_yaw(femoral)
     if notch < CONDYLE.yawed_notch_depth or abs(yaw) <= YAW_SEARCH.largest_yaw:
         return
@@ -175,7 +169,7 @@ def _check_yaw(femoral: Surface) -> None:
 
 @dataclass(frozen=True)
 class Orientation:
-    """Orientation of a femoral component on an insert, from its shape and its pose.
+    """Orientation of a femoral component on an insert.
 
     Args:
         flexion: rad, from -pi to pi; at 0 the bone side faces up.
@@ -191,12 +185,12 @@ class Orientation:
 
 
 def orientation(femoral: Surface, pose: Array) -> Orientation | None:
-    """Return the orientation of a femoral component on the insert; None if its shape is unclear.
+    """Return the orientation; None if the component's shape is unclear.
 
-    Of the mesh's axes only z is used, the medial-lateral axis. The inner surface faces the middle
+    Of the mesh's axes only z, the medial-lateral axis, is used. The inner surface faces the middle
     of the bounding box; the sum of its area vectors points out of the opening, towards the bone.
     The upper half of the strip between the condyles belongs to the flange, which is in front. The
-    error of the flexion is about 10 deg. `pose` is pose_femoral_in_insert (4, 4).
+    error of the flexion is about 10 deg; `pose` is pose_femoral_in_insert (4, 4).
     """
     middle, centroids = femoral.bounds.mean(axis=0), femoral.triangles.mean(axis=1)
     inner = np.einsum("kj,kj->k", femoral.face_normals, centroids - middle) < 0.0
@@ -242,7 +236,7 @@ def orientation(femoral: Surface, pose: Array) -> Orientation | None:
 def condyle_faces(femoral: Surface, split: float | None) -> tuple[Index, Index]:
     """Return the triangles (k,) of the medial and of the lateral condyle.
 
-    A triangle's centroid decides its side. Without a split all triangles are medial.
+    A triangle's centroid decides its side; without a split all are medial.
     """
     if split is None:
         return np.arange(len(femoral.faces)), np.empty(0, np.int64)
@@ -251,13 +245,13 @@ def condyle_faces(femoral: Surface, split: float | None) -> tuple[Index, Index]:
 
 
 def _samples(femoral: Surface, spacing: float) -> Array:
-    """Return samples of a surface and the corners of its triangles, (s, 3), m."""
+    """Return samples of a surface and its triangles' corners, (s, 3), m."""
     corners = femoral.vertices[np.unique(femoral.faces)]
     return np.concatenate([sampled(femoral, spacing)[0], corners])
 
 
 def _mean_outline(samples: Array, width: float, flexions: Array) -> tuple[Array, Array]:
-    """Return height (n,), m, of the outline above its lowest point, and z (n,), m, of strips."""
+    """Return the outline's height (n,), m, above its lowest point, and z (n,), m, of strips."""
     low, high = samples[:, 2].min(), samples[:, 2].max()
     count = max(int(np.ceil((high - low) / width)), 3)
     strip = np.clip(((samples[:, 2] - low) / (high - low) * count).astype(int), 0, count - 1)
@@ -275,7 +269,7 @@ def _mean_outline(samples: Array, width: float, flexions: Array) -> tuple[Array,
 
 
 def _rise(outline: Array) -> Array:
-    """Return the height (n,), m, of each strip above the higher of the valleys on its two sides."""
+    """Return the height (n,), m, of each strip above the higher valley beside it."""
     left_valley = np.minimum.accumulate(outline)
     right_valley = np.minimum.accumulate(outline[::-1])[::-1]
     return np.asarray(outline - np.maximum(left_valley, right_valley), float)
@@ -284,9 +278,9 @@ def _rise(outline: Array) -> Array:
 class LowestPoints:
     """Lowest point of each condyle along the insert's y, prepared for many poses.
 
-    The point has the y of the lowest vertex. Its x and z are means over the condyle's surface with
-    the weight exp(-height / `CONDYLE.facet_depth`), height above the lowest vertex. The point
-    therefore moves smoothly. `split` is z (m, femoral frame) between the condyles; None for one.
+    The point has the y of the lowest vertex. For a smooth movement its x and z are means over the
+    condyle's surface with the weight exp(-height / `CONDYLE.facet_depth`), height above the lowest
+    vertex. `split` is z (m, femoral frame) between the condyles; None for one.
     """
 
     def __init__(self, femoral: Surface, split: float | None) -> None:

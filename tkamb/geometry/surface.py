@@ -40,7 +40,7 @@ NO_TURN = 1e-3
 class Surface:
     """A triangulated surface; the right-hand rule gives the outward normals.
 
-    Trees, normals and other derived objects are computed at first use and stored.
+    Derived objects (trees, normals) are computed at first use.
 
     Args:
         vertices: (n, 3) m.
@@ -93,10 +93,10 @@ class Surface:
 
     @cached_property
     def barycentric_rows(self) -> Array:
-        """Rows (k, 2, 3), 1/m, that give barycentric coordinates; NaN for a degenerate triangle.
+        """Rows (k, 2, 3), 1/m; NaN for a degenerate triangle.
 
-        Their product with a point's offset from the triangle's first corner is the second and the
-        third barycentric coordinate.
+        With a point's offset from the first corner they give the second and third barycentric
+        coordinate.
         """
         a, b, c = np.moveaxis(self.triangles, 1, 0)
         first, second, normal = b - a, c - a, self._cross
@@ -107,8 +107,7 @@ class Surface:
     def barycentric(self, points: Array, faces: Index) -> Array:
         """Return the barycentric coordinates (n, 3) of points (n, 3), m, on triangles (n,).
 
-        For a point outside its triangle they are clipped to 0 to 1. On a degenerate triangle they
-        are one third.
+        Outside a triangle they are clipped to 0 to 1; on a degenerate one they are one third.
         """
         weights = np.empty((len(points), 3))
         offset = points - self.triangles[faces, 0]
@@ -127,7 +126,7 @@ class Surface:
 
     @cached_property
     def corner_vertices(self) -> Index:
-        """Vertices (k, 3) of the faces, numbered so that vertices at one place have one number."""
+        """Vertices (k, 3) of the faces; those at one place have one number."""
         return self.faces if self.merged else same_places(self.vertices)[1][self.faces]
 
     @cached_property
@@ -269,7 +268,7 @@ class Surface:
         return float(np.einsum("kj,kj->", a, np.cross(b, c)) / 6.0)
 
     def moved(self, pose_here_in_there: Array) -> "Surface":
-        """Return the surface in another frame; the surface itself if the pose is the identity."""
+        """Return the surface in another frame; itself for the identity."""
         if np.array_equal(pose_here_in_there, np.eye(4)):
             return self
         vertices = transform(pose_here_in_there, self.vertices)
@@ -283,10 +282,10 @@ class Surface:
     def remade(
         self, vertices: Array, faces: Index, pose_here_in_there: Array | None = None
     ) -> "Surface":
-        """Return a surface that was made of this one, with the defects of this one.
+        """Return a surface made of this one, with its defects.
 
         Args:
-            vertices: (n, 3) m, moved, worn or more than those of this surface.
+            vertices: (n, 3) m, moved, worn or more.
             pose_here_in_there: pose or mirror image (4, 4) that moves the defects; None: identity.
         """
         merged = self.merged and len(vertices) == len(self.vertices)
@@ -296,7 +295,7 @@ class Surface:
         return remade
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the fields and the defects; others are larger and computed again."""
+        """Return fields and defects; the rest is larger and computed again."""
         state = {field.name: getattr(self, field.name) for field in fields(self)}
         known = {} if "defects" not in self.__dict__ else {"defects": self.defects}
         return state | known
@@ -306,7 +305,7 @@ def corner_normals(surface: Surface, crease: float, weights: Array) -> Array:
     """Return unit normals (k, 3, 3), one per triangle and corner.
 
     It is the weighted mean over triangles at the vertex whose normals differ by at most `crease`,
-    so that a sharp edge does not tilt the normals beside it. Vertices at one place count as one. A
+    so that a sharp edge does not tilt the normals beside it. Vertices at one place count as one; a
     triangle without area has zero normals.
 
     Args:
@@ -334,7 +333,7 @@ def corner_normals(surface: Surface, crease: float, weights: Array) -> Array:
 
 
 def corner_angles(surface: Surface) -> Array:
-    """Return the angles (k, 3), rad, of triangles at their corners."""
+    """Return angles (k, 3), rad, of triangles at their corners."""
     corners = surface.triangles
     ahead = np.roll(corners, -1, axis=1) - corners
     behind = np.roll(corners, 1, axis=1) - corners
@@ -355,7 +354,7 @@ def sharp_edges(surface: Surface, sharp: float = SHARP_EDGE) -> Mask:
 
 
 def _sums(index: Index, rows: Array, count: int = 0) -> Array:
-    """Return the sum (n,) of the rows (m, n) of each index (m,); at least `count` sums."""
+    """Return the sum (n,) of the rows (m, n) of each index (m,); at least `count`."""
     return np.stack([np.bincount(index, column, count) for column in rows.T], axis=1)
 
 

@@ -77,14 +77,14 @@ PATELLAR_LIGAMENT = "patellar_ligament"
 class KneeData:
     """Data that a caller passes from call to call to save time; `Knee.create_data` makes it.
 
-    Results change at most within the solver's tolerance.
+    Results change at most within the solver's tolerance; None: not computed yet, or not modelled.
 
     Args:
         data: Pinocchio data of the user's model.
         probe: probe of the contact model, with the last contact as warm start; None: no contact
             model.
         patella: state of the patella from the last call; None: not computed yet.
-        seen: bytes of the last pose, and the contact at that pose; None: not computed yet.
+        seen: bytes of the last pose, and the contact there.
         start: warm start of the next press, from the last press or evaluation; None: there was
             none.
         button_start: warm start of the next press of the button; None: there was none.
@@ -108,9 +108,8 @@ class KneeData:
 
 
 class AssembledKnee:
-    """The parts of a knee on a Pinocchio model, and their poses; `tkamb.Knee` adds the loads.
-
-    The arguments are those of `tkamb.Knee`.
+    """The parts of a knee on a Pinocchio model, and their poses; see `tkamb.Knee`, which adds the
+    loads.
     """
 
     def __init__(
@@ -204,13 +203,12 @@ class AssembledKnee:
 
     @property
     def _instant_ligaments(self) -> "tuple[Ligament, ...]":
-        """The ligaments of the equations, without those of a released patella."""
+        """Without those of a released patella."""
         if self.patella is None or not self._has_own_patella_lines:
             return self.ligaments
         return tuple(bundle for bundle in self.ligaments if bundle not in self._others)
 
     def _with_patella(self, patella: "PatellaMethod") -> Self:
-        """Return the same knee with a released patella; everything else is shared."""
         other = copy.copy(self)
         other.patella = patella
         return other
@@ -231,22 +229,22 @@ class AssembledKnee:
 
     @property
     def femoral(self) -> Any:
-        """The femoral component in its own frame, mirrored for a left knee; None: not given."""
+        """In its own frame, mirrored for a left knee; None: not given."""
         return self._surfaces.femoral
 
     @property
     def insert(self) -> Any:
-        """The insert in the insert frame, mirrored for a left knee; None: not given."""
+        """In the insert frame, mirrored for a left knee; None: not given."""
         return self._surfaces.insert
 
     @property
     def button(self) -> Any:
-        """The patellar button in the patella's frame, mirrored for a left knee; None: not given."""
+        """In the patella's frame, mirrored for a left knee; None: not given."""
         return self._surfaces.button
 
     @property
     def _query(self) -> "ClosestPointQuery":
-        """Query for closest points of femoral component and insert, prepared at the first use."""
+        """Prepared at the first use."""
         return self._need_contact().pair.closest_points
 
     def create_data(self) -> KneeData:
@@ -255,7 +253,6 @@ class AssembledKnee:
         return KneeData(self.model.createData(), probe, knee=self._identity)
 
     def _kinematic_data(self) -> KneeData:
-        """Return data for calls that compute no contact."""
         return KneeData(self.model.createData(), knee=self._identity)
 
     def _data(self, data: KneeData | None, contact: bool = True) -> KneeData:
@@ -289,8 +286,8 @@ class AssembledKnee:
         """Return the knee coordinates (6,) in the order of `KNEE_COORDINATES`, m and rad.
 
         ap, si and ml are translations along x, y and z of the insert frame, with z to the patient's
-        right for both knees. The rotations are those of Grood and Suntay
-        (`tkamb.geometry.frames`), with their clinical signs for both knees.
+        right for both knees. The rotations are Grood and Suntay's (`tkamb.geometry.frames`), with
+        clinical signs for both knees.
         """
         kinematics = self._kinematics(self._kinematic_data(), q)
         return self._coordinate_signs * kinematics.coordinates
@@ -318,9 +315,7 @@ class AssembledKnee:
         """Return the loads of the extensor mechanism, and of ligaments that end on the patella.
 
         Args:
-            kinematics: pose of the knee.
             patella: the patella at this pose; None: not modelled.
-            tensions: muscle -> tension, N.
         """
         poses, total = self._link_poses(kinematics, patella), list[PointForces]()
         if self._plane_lines:
@@ -350,16 +345,15 @@ class AssembledKnee:
         return self.bridge.relative_jacobian(data.data, self._check_q(q))
 
     def _drawn_links(self, q: Array, femur: Array, data: KneeData) -> tuple[dict[str, Array], bool]:
-        """Return link -> pose (4, 4) in the insert frame. A left knee is mirrored to a right one.
+        """Return link -> pose (4, 4) in the insert frame, of a left knee mirrored.
 
         Args:
-            q: configuration, shape (nq,); it gives the pose of a patella of the model.
-            femur: pose of the femoral component in the insert frame, shape (4, 4).
-            data: from `create_data`.
+            q: configuration, (nq,); it gives the pose of a patella of the model.
+            femur: pose of the femoral component in the insert frame, (4, 4).
 
         Returns:
-            The poses, and whether they include the patella. It is missing if its search failed or
-            if the knee has no extensor mechanism.
+            Whether they include the patella, which is missing if its search failed or
+            the knee has no extensor mechanism.
         """
         kinematics, patella = replace(self._kinematics(data, q), pose=femur), None
         if self.extensor is not None:
@@ -370,9 +364,9 @@ class AssembledKnee:
         return self._link_poses(kinematics, patella), patella is not None
 
     def _extensor_paths(self, poses: dict[str, Array]) -> dict[str, Array]:
-        """Return the paths (n, 3), m, of quadriceps and patellar ligament, insert frame.
+        """Return (n, 3), m, of quadriceps and patellar ligament, insert frame.
 
-        The result is empty without an extensor mechanism or without a pose of the patella.
+        It is empty without an extensor mechanism or a pose of the patella.
         """
         if self.extensor_lines is None or "patella" not in poses:
             return {}
@@ -400,7 +394,7 @@ class AssembledKnee:
         return array
 
     def _check_q(self, q: Array) -> Array:
-        """Return q after a check of its size, its quaternions and the angles of the knee."""
+        """Check size, quaternions and angles of the knee."""
         q = self._check(q, "q", self.model.nq)
         # 60 rad have a valid pose, of another flexion: the result would look right.
         for k, joint in self.anatomy.angles.items():
@@ -419,7 +413,7 @@ class AssembledKnee:
         return q
 
     def _check_place(self, pose: Array) -> None:
-        """Raise an error if the components are nowhere near each other.
+        """Raise if the components are nowhere near each other.
 
         Raises:
             ComputationError: the femoral component is far from the insert, or below it.
@@ -456,7 +450,7 @@ class AssembledKnee:
 
     @property
     def _finds_patella(self) -> bool:
-        """Whether equilibrium determines the patella's pose, because the model has no patella."""
+        """True if the model has no patella, so that equilibrium gives its pose."""
         return self.anatomy.patella is None
 
     @property
@@ -508,7 +502,7 @@ class AssembledKnee:
         return poses
 
     def _with_lines(self, data: KneeData, tensions: Mapping[str, float], forces: Any) -> Any:
-        """Return forces on the joints with the forces of the muscle lines added.
+        """Return forces on the joints with those of the muscle lines added.
 
         Args:
             data: data with joint placements up to date.
@@ -527,13 +521,13 @@ class AssembledKnee:
 
 
 def _placement(pose: Any) -> pin.SE3 | None:
-    """Return a pose, `pin.SE3` or (4, 4), as `pin.SE3`."""
+    """Return `pin.SE3` for `pin.SE3` or (4, 4)."""
     if pose is None or isinstance(pose, pin.SE3):
         return pose
     return se3(np.asarray(pose, float))
 
 
 def _identity(knee: AssembledKnee) -> str:
-    """Return words for a knee, with a random number that no other knee has."""
+    """Return words for a knee, with a random number of its own."""
     contact = "no contact" if knee.contact is None else knee.contact.model.name
     return f"'{knee.model.name}, {knee.side}, {contact}, {uuid.uuid4().hex[:8]}'"

@@ -1,18 +1,17 @@
 """Equilibrium of a few coordinates under forces that depend on them: Newton in a trust region.
 
-Let r(q) be the force that drives each coordinate, and K = -dr/dq the stiffness. A step d solves
-(K + lambda I) d = r. lambda is the smallest value with which the step descends and stays inside the
-region. The ratio W / W_K decides whether the step is accepted. W is the work of the forces along
-the step (trapezoidal rule), and W_K is the work that K predicts:
+Let r(q) be the force that drives each coordinate, and K = -dr/dq the stiffness. A step d solves (K
++ lambda I) d = r. lambda is the smallest value with which the step descends and stays inside the
+region. The ratio of W, the work of the forces along the step (trapezoidal rule), and W_K, the work
+that K predicts, decides whether the step is accepted:
 
     W = (r(q) + r(q + d)) . d / 2          W_K = r(q) . d - d . K d / 2
 
 If the forces have a potential, W is the energy that a step releases. A trial that overshoots into a
-stiff contact has W < 0 and is rejected. Follower loads make K unsymmetric. An equilibrium may then
+stiff contact has W < 0 and is rejected. Follower loads make K unsymmetric, and an equilibrium may
 be stable although K is not positive definite. Near it, work does not show whether a step comes
-closer. There the search takes Newton steps, and |r| decides on acceptance. A search that does not
-converge is repeated once. In the second search |r| decides for full Newton steps, and work for
-shorter steps.
+closer: there the search takes Newton steps, and |r| decides on acceptance. A search that does not
+converge is repeated once: |r| then decides for full Newton steps, and work for shorter steps.
 
 All coordinates are in metres and all forces in newtons: rotations are scaled by a lever arm.
 
@@ -35,33 +34,37 @@ class BalanceSettings:
     """Tolerances and limits of the search for the released coordinates."""
 
     force_tolerance: float = 0.05
-    """N (moments are divided by the lever arm): residual below which a coordinate has converged. If
-    the noise of the forces is larger, the noise replaces this tolerance. It is far
-    below the resolution of the reports."""
+    """N (moments are divided by the lever arm): residual below which a coordinate has converged.
+    Larger noise of the forces replaces it. It is far below the resolution of the reports.
+    """
     step_tolerance: float = 2e-6
     """m: Newton step below which a coordinate has converged. Not studied."""
     least_stiffness: float = 100.0
-    """N/m: a state with a smaller stiffness is indeterminate. Such a state moves by
-    more than 10 mm per newton."""
+    """N/m: a state with a smaller stiffness is indeterminate: it moves by more than 10 mm per
+    newton.
+    """
     narrow_radius: float = 1e-6
     """m: trust radius below which finite differences replace an approximate stiffness.
     An approximation that needs shorter steps does not reduce the residual."""
     jump_step: float = 1e-7
-    """m: a step below which a change of force that the stiffness does not explain is a jump.
-    It moves a contact of 1e7 N/m by 1 N at most, which the stiffness explains."""
+    """m: step below which a change of force that the stiffness does not explain is a jump. A
+    contact of 1e7 N/m changes by 1 N at most.
+    """
     largest_jump: float = 1.0
-    """N: largest jump on which an equilibrium may lie. 0.1 % of a usual load. Measured: at
-    2 mm 3 of 72 frames of subject JW had no equilibrium without it; the foundation's force jumped
-    there by 0.2 to 0.6 N, where a column crosses an edge of two facets of the femur."""
+    """N: largest jump on which an equilibrium may lie. 0.1 % of a usual load. Measured: at 2 mm 3
+    of 72 frames of subject JW had no equilibrium without it; the foundation's force jumped by 0.2
+    to 0.6 N, where a column crosses an edge of two femoral facets.
+    """
     max_travel: float = 20e-3
-    """m: largest distance of a coordinate from its initial guess; beyond it the search ends.
-    A coordinate that moves as far has no stable equilibrium."""
+    """m: largest distance of a coordinate from its initial guess, at which the search ends. A
+    coordinate that moves as far has no stable equilibrium.
+    """
     difference_step: float = 2e-6
     """m: step of the finite differences of the force. Equal to `step_tolerance`."""
     max_prediction_error: float = 0.5
-    """1: relative error of the predicted change of force. A larger error discards all corrections
-    of an approximate stiffness. With a larger error a step does not reduce the
-    residual reliably."""
+    """1: relative error of the predicted change of force that discards all corrections of an
+    approximate stiffness. With a larger error a step does not reduce the residual reliably.
+    """
     max_steps: int = 200
     """Maximum number of steps. A lightly loaded knee that slides 16 mm over lattice
     cells of 2 mm needs 80."""
@@ -89,8 +92,8 @@ class Trial:
     """The forces at trial coordinates.
 
     Args:
-        force: driving forces, shape (n,), N, positive along the positive coordinates; NaN: unknown.
-        stiffness: -d force / d coordinates, shape (n, n), N/m; None: by finite differences.
+        force: driving forces, (n,), N, positive along the positive coordinates; NaN: unknown.
+        stiffness: -d force / d coordinates, (n, n), N/m; None: by finite differences.
         exact: whether `stiffness` is the exact tangent. The search corrects an approximation from
             step to step.
         force_noise: error of the force, N; a force below it counts as zero.
@@ -107,9 +110,9 @@ class Balance:
     """The result of a search.
 
     Args:
-        coordinates: last coordinates, shape (n,), m.
-        force: residual, shape (n,), N.
-        stiffness: stiffness at these coordinates, shape (n, n), N/m.
+        coordinates: last coordinates, (n,), m.
+        force: residual, (n,), N.
+        stiffness: stiffness at these coordinates, (n, n), N/m.
         steps: number of accepted and rejected steps.
         smallest_stiffness: smallest real part of the stiffness' eigenvalues, N/m.
         work: work of the forces along each accepted step, N·m.
@@ -141,10 +144,10 @@ def find_balance(
     """Find the coordinates at which all forces are in equilibrium.
 
     Args:
-        forces: function of coordinates (n,), m, that returns a `Trial`.
-        start: initial guess, shape (n,), m.
-        stiffness: stiffness of an earlier, similar search, shape (n, n), N/m. It saves trials if
-            `forces` gives no stiffness.
+        forces: coordinates (n,), m -> `Trial`.
+        start: initial guess, (n,), m.
+        stiffness: stiffness of an earlier, similar search, (n, n), N/m. It saves trials if `forces`
+            gives no stiffness.
         residual_share: remaining Newton step, relative to the distance from the initial guess, at
             which the search ends early; 0: the tolerances alone decide. Use it for a search that is
             repeated under other forces.
@@ -279,7 +282,7 @@ class _Search:
                 )
 
     def _next(self) -> tuple[Array, float]:
-        """Return the next step, and its share of Newton's step; 0: it is no Newton step."""
+        """Return the next step, and its share of Newton's step; 0: it is no such step."""
         symmetric, smallest_stiffness = smallest_eigenvalues(self.stiffness)
         if symmetric > 0 or smallest_stiffness <= 0 or self._newton_rejected:
             return bounded_step(self.stiffness, self.force, self._radius), 0.0
@@ -315,7 +318,7 @@ class _Search:
 
         If both ends have an approximate stiffness, the update corrects their mean. If the change of
         force differs too much from its prediction (contact was made or lost), all updates are
-        discarded, unless the stiffness comes from new finite differences.
+        discarded, unless new finite differences gave the stiffness.
         """
         expected = self.stiffness @ step
         if self._model_stiffness is not None and trial.stiffness is not None:
@@ -347,7 +350,6 @@ class _Search:
         return float(np.abs(self.x - self._start).max())
 
     def _close_enough(self) -> bool:
-        """Return whether the remaining step is small against the distance from the guess."""
         # Newton's step estimates the remaining distance.
         distance = self._residual_share * float(np.linalg.norm(self.x - self._start))
         if distance == 0.0 or self._smallest_stiffness() <= BALANCE.least_stiffness:
@@ -398,10 +400,9 @@ MAX_HALVINGS = 6
 
 
 def polished(forces: Forces, start: Array, size: float) -> tuple[Array, Trial]:
-    """Return the coordinates of the smallest residual that Newton's method finds, and its trial.
+    """Return the coordinates of smallest residual by Newton's method, and their trial.
 
     Args:
-        forces: function of a search.
         start: coordinates (n,) near the equilibrium, m.
         size: load to which the residual is compared, N.
     """
@@ -434,8 +435,8 @@ def bounded_step(stiffness: Array, force: Array, radius: float) -> Array:
     """Return the Newton step (n,), m, or a shorter, descending step within the radius.
 
     Args:
-        stiffness: stiffness, not necessarily symmetric, shape (n, n), N/m.
-        force: driving forces, shape (n,), N.
+        stiffness: stiffness, not necessarily symmetric, (n, n), N/m.
+        force: driving forces, (n,), N.
         radius: trust radius, m.
     """
     symmetric, smallest_stiffness = smallest_eigenvalues(stiffness)
@@ -461,7 +462,7 @@ def bounded_step(stiffness: Array, force: Array, radius: float) -> Array:
 def smallest_eigenvalues(stiffness: Array) -> tuple[float, float]:
     """Return the smallest eigenvalue of the symmetric part, and the smallest real part.
 
-    Follower loads make a stiffness unsymmetric. A state is then stable against divergence if the
+    Follower loads make a stiffness unsymmetric; the state is stable against divergence if the
     second value is positive.
     """
     return _smallest_eigenvalues(stiffness.tobytes(), len(stiffness))
@@ -469,7 +470,7 @@ def smallest_eigenvalues(stiffness: Array) -> tuple[float, float]:
 
 @lru_cache(maxsize=4)
 def _smallest_eigenvalues(entries: bytes, count: int) -> tuple[float, float]:
-    """Return `smallest_eigenvalues`, cached because each step of a search uses it repeatedly."""
+    """Return `smallest_eigenvalues`; each step of a search asks repeatedly."""
     stiffness = np.frombuffer(entries).reshape(count, count)
     # The symmetric part decides whether a step descends. The eigenvalues decide on stability.
     symmetric = float(np.linalg.eigvalsh(0.5 * (stiffness + stiffness.T))[0])

@@ -70,7 +70,7 @@ def se3(pose: Array) -> pin.SE3:
 
 
 class CanonicalChain(Chain):
-    """The canonical chain of one knee, described at the top of this module.
+    """The canonical chain of one knee; see the module.
 
     `component` are axes of the femoral component, fixed to the femur's joint; `insert` is the
     insert frame, fixed to the tibia's joint.
@@ -150,7 +150,7 @@ class KneePose:
     """The pose of a right knee, or of the mirror image of a left one, at one instant.
 
     Args:
-        pose: pose of the femoral component in the insert frame, (4, 4).
+        pose: femoral component in the insert frame, (4, 4).
         patella: coordinates (3,), m, m, rad; None: the model has no patella.
     """
 
@@ -164,10 +164,9 @@ class KneePose:
 
 
 class Bridge:
-    """Converts poses, motions and loads between the user's model and the canonical chain.
+    """Converts poses, motions and loads between the user's model and the chain.
 
-    `component` and `insert` are those of `CanonicalChain`. A `data` of the methods is Pinocchio
-    data of the user's model, with joint placements up to date.
+    `data` is Pinocchio's of the user's model, with joint placements up to date.
     """
 
     def __init__(
@@ -187,13 +186,13 @@ class Bridge:
             self._shank = tuple(anatomy.model.subtrees[anatomy.knee_joints[0]])
 
     def link_point(self, point: LinkPoint) -> LinkPoint:
-        """Return a point on a frame of the user's model as a point on a link of the chain."""
+        """Return a point on the user's model as a point on the chain."""
         link, in_link = self._on_link(point.link)
         local = in_link.act(np.asarray(point.position, float))
         return LinkPoint(link, MIRROR @ local if self.left else np.array(local))
 
     def wrap_object(self, wrap: "WrapObject") -> "WrapObject":
-        """Return a wrap object on a frame of the user's model as one on a link of the chain."""
+        """Return a wrap object on the user's model as one on the chain."""
         link, in_link = self._on_link(wrap.body)
         moved = wrap.on(link, in_link.homogeneous)
         return moved.mirrored() if self.left else moved
@@ -234,7 +233,7 @@ class Bridge:
     def twist(self, data: Any) -> Array:
         """Return the femur's twist (6,) relative to the insert, at the insert's origin and axes.
 
-        `data` has velocities up to date.
+        `data` needs velocities up to date.
         """
         total, joint = np.zeros(6), self.component.joint
         if joint:
@@ -247,8 +246,8 @@ class Bridge:
     def motion(self, data: Any, patella: bool) -> ChainMotion:
         """Return the motion of the chain.
 
-        `data` is that after `pin.forwardKinematics(..., q, v, a)`. Without a patella in the user's
-        model, its coordinates and rates are zero.
+        `data` is that after `pin.forwardKinematics(..., q, v, a)`; a missing patella has zero
+        coordinates and rates.
         """
         anatomy, knee = self.anatomy, self.knee_pose(data)
         tibia, zero = anatomy.tibia, pin.Motion.Zero()
@@ -286,7 +285,7 @@ class Bridge:
         """Return coordinates, rates and accelerations (3, n) between two bodies.
 
         q is that of the chain with its root at the neutral pose; `base` is on the parent body,
-        `follower` on the child; `rows` are these coordinates in the chain's joint coordinates.
+        `follower` on the child; `rows` are theirs in the chain's joint coordinates.
         """
         twist, rate = self._relative(data, base, follower)
         model, cache = self.chain.model, self._chain_data
@@ -301,7 +300,7 @@ class Bridge:
         return np.stack([coordinates, v[columns], acceleration])
 
     def _relative(self, data: Any, base: FixedFrame, follower: FixedFrame) -> tuple[Array, Array]:
-        """Return s and s' (6,) of the equations above, in the axes of the child body."""
+        """Return s and s' (6,) of the equations above, in the child body's axes."""
         placement, zero = data.oMi[follower.joint] * follower.placement, pin.Motion.Zero()
         child_twist, child_rate = (
             follower.placement.actInv(zero if not follower.joint else values[follower.joint])
@@ -333,10 +332,10 @@ class Bridge:
         return total
 
     def configuration(self, q: Array, target: Array) -> Array:
-        """Return q with the knee's joints changed so that the femur has a given pose.
+        """Return q with the knee's joints changed, by Newton's method, to the femur's pose
+        `target`.
 
-        Newton's method finds the coordinates of the joints between tibia and femur. `target` is
-        pose_femoral_in_insert of a right knee.
+        It is pose_femoral_in_insert of a right knee.
         """
         model = self.anatomy.model
         data, placement = model.createData(), self._placed(target)
@@ -370,9 +369,8 @@ class Bridge:
     def shank_needs(self, data: Any) -> Array:
         """Return the wrench (6,) that inertia and weight of the shank require, insert frame.
 
-        It sums over the shank's bodies; if the tibia is fixed to the universe, it is the negative
-        of the sum over all bodies above the knee. `data` is that after
-        `pin.forwardKinematics(model, data, q, v, a)`.
+        If the tibia is fixed to the universe, it is the negative of the sum over all bodies above
+        the knee. `data` is that after `pin.forwardKinematics(model, data, q, v, a)`.
         """
         needs = []
         for joint in self._shank:
@@ -391,7 +389,7 @@ class Bridge:
         return PointForces("tibia", np.zeros((1, 3)), wrench[None, :3], wrench[3:])
 
     def _sum(self, data: Any, joints: Sequence[int], forces: Sequence[pin.Force]) -> Array:
-        """Return the sum (6,) of forces on joints about the insert's origin, insert frame."""
+        """Return the sum (6,) about the insert's origin, insert frame."""
         insert = data.oMi[self.insert.joint] * self.insert.placement
         total = np.zeros(6)
         for joint, force in zip(joints, forces, strict=True):
@@ -400,7 +398,7 @@ class Bridge:
         return mirrored_spatial(total) if self.left else total
 
     def external_on(self, frame: FixedFrame | None, data: Any, external: Any) -> Array:
-        """Return the external wrench (6,) on the body that a frame is fixed to, insert frame."""
+        """Return the external wrench (6,) on a frame's body, insert frame."""
         joint = 0 if frame is None else frame.joint
         if external is None or not joint:
             return np.zeros(6)
@@ -427,14 +425,14 @@ class Bridge:
         return pin.StdVec_Force(forces)
 
     def joint_of(self, link: str) -> int:
-        """Return the user's joint that carries a link; a missing patella is part of the femur."""
+        """Return the user's joint of a link; a missing patella is part of the femur."""
         patella = self.anatomy.patella
         if link == "patella" and patella is not None:
             return patella.joint
         return self.insert.joint if link == "tibia" else self.component.joint
 
     def to_joint(self, data: Any, link: str) -> Array:
-        """Return the matrix (6, 6) that maps a force from the insert frame to a link's joint."""
+        """Return the (6, 6) map of a force from the insert frame to a link's joint."""
         insert = data.oMi[self.insert.joint] * self.insert.placement
         return np.asarray(data.oMi[self.joint_of(link)].actInv(insert).toDualActionMatrix())
 
@@ -451,7 +449,7 @@ class Bridge:
 
 
 def summed(loads: "dict[str, Array] | list[PointForces]") -> dict[str, Array]:
-    """Return link -> sum (6,) of its loads about the insert's origin, insert frame."""
+    """Return link -> sum (6,) about the insert's origin, insert frame."""
     if isinstance(loads, dict):
         return loads
     total: dict[str, Array] = {}
@@ -462,7 +460,7 @@ def summed(loads: "dict[str, Array] | list[PointForces]") -> dict[str, Array]:
 
 
 def _solved(jacobian: Array, twist: Array) -> Array:
-    """Return the joint rates that produce a twist (6,), by least squares if fewer than six."""
+    """Return joint rates for a twist (6,), by least squares if fewer than six."""
     if not (np.isfinite(jacobian).all() and np.isfinite(twist).all()):
         return np.full(jacobian.shape[1], np.nan)
     if jacobian.shape[1] == 6:
@@ -473,7 +471,7 @@ def _solved(jacobian: Array, twist: Array) -> Array:
 def canonical_state(
     chain: Chain, motion: ChainMotion, shank: Array, thigh: Array, patella: Array
 ) -> ChainState:
-    """Return the chain at one instant, with the inertia of the shank from the user's model.
+    """Return the chain at one instant, with the shank's inertia from the user's model.
 
     The wrenches (6,) that inertia and weight of the shank require, and the external ones on thigh
     and patella, are in the insert frame.

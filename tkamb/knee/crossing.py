@@ -5,7 +5,7 @@ force F pulls the shank at p along u = (q - p)/|q - p|, and the thigh at q along
 are one body: a line that ends on the foot pulls it where the line leaves the foot. The force of a
 line from the pelvis acts on the femur, and the hip loads balance it.
 
-With fixed contact points and lines the equations are linear in all loads. This has two uses.
+With fixed contact points and lines the equations are linear in all loads. This has two uses:
 
 1. The tension Q of the extensor group is linear in the forces F_i of the other muscles and in a
    moment r on the tibia about the insert's z (docs/muscles.md). Solved for r, this is the knee's
@@ -21,10 +21,10 @@ With fixed contact points and lines the equations are linear in all loads. This 
 
        N_side = N_side(weight, inertia and ground) + N_side(ligaments) + sum_i N_side(muscle i),
 
-   plus N_side(post) if a cam on the insert's post is modelled. Each term has all other muscles and
-   ligaments at zero force, and a moment about the insert's z balances its flexion moment; over all
-   terms these moments add up to the knee's reserve. As in every frame, residuals balance the AP and
-   ML force and the axial moment. The extensor group is one muscle here.
+plus N_side(post) if a cam on the insert's post is modelled. Each term has all other muscles and
+ligaments at zero force; a moment about the insert's z balances its flexion moment, and these
+moments add up to the knee's reserve. As in every frame, residuals balance the AP and ML force and
+the axial moment. The extensor group is one muscle here.
 
 References: Winby et al., J Biomech 42:2294 (2009), doi:10.1016/j.jbiomech.2009.06.019;
 Sasaki & Neptune, J Biomech 43:2780 (2010), doi:10.1016/j.jbiomech.2010.06.011.
@@ -64,8 +64,8 @@ class CrossingLines:
     def turned(self, state: "ChainState") -> float:
         """Return the rotation of the knee since the points were computed, rad; NaN: unknown.
 
-        The end of a line that wraps a bone or passes a via point moves as the knee rotates, but
-        here it is fixed. The error of the direction is at most about this rotation.
+        The error of a line's direction is at most about this: the end of a line that wraps a bone
+        or passes a via point moves with the knee, but here it is fixed.
         """
         if self.knee is None:
             return float("nan")
@@ -74,7 +74,7 @@ class CrossingLines:
         return float(change.magnitude())
 
     def unit_wrenches(self, tibia: Array, femur: Array) -> Array:
-        """Return the wrenches (..., c, 6) on the insert at a force of one newton in each line.
+        """Return the wrenches (..., c, 6) on the insert at one newton in each line.
 
         `tibia` (4, 4) and `femur` (..., 4, 4) are poses of the links in the insert frame.
         """
@@ -92,13 +92,13 @@ class CrossingLines:
         ]
 
     def loads(self, state: "ChainState", force: Array) -> tuple[PointForces, PointForces]:
-        """Return the loads on tibia and femur at forces (c,), N, in the lines, insert frame."""
+        """Return the loads on tibia and femur at forces (c,), N, insert frame."""
         start, end, directions = self._ends(state)
         pulls = force[:, None] * directions
         return PointForces("tibia", start, pulls), PointForces("femur", end, -pulls)
 
     def _ends(self, state: "ChainState") -> tuple[Array, Array, Array]:
-        """Return the starts, ends and unit directions (c, 3) of the lines, insert frame."""
+        """Return starts, ends and unit directions (c, 3), insert frame."""
         start = transform(state.pose("tibia"), self.shank)
         end = transform(state.pose("femur"), self.thigh)
         directions = end - start
@@ -132,7 +132,7 @@ class MuscleShare:
     both_loaded: bool = True
 
     def loads(self, state: "ChainState") -> tuple[PointForces, ...]:
-        """Return the loads of the crossing muscles and the knee's reserve on tibia and femur."""
+        """Return the crossing muscles' and the reserve's loads on tibia and femur."""
         line_loads = self.lines.loads(state, self.force[self.crossing])
         return (*line_loads, *unknowns.moment_pair("tibia", "femur", self._knee_reserve))
 
@@ -145,7 +145,7 @@ class MuscleShare:
 
     @property
     def _knee_reserve(self) -> Array:
-        """The knee's reserve moment on the tibia about the insert's z, (3,), N·m."""
+        """On the tibia about the insert's z, (3,), N·m."""
         return self.reserve[self.flexion] * unknowns.AXES["ml"]
 
 
@@ -169,8 +169,8 @@ def flexion_row(
 ) -> FlexionRow:
     """Return the knee's row of the static optimisation, with a taut extensor mechanism.
 
-    `geometry` has an extensor mechanism; the forces of its other muscles are not used. `friction`
-    is the femorotibial coefficient, `lifted` the sides without load.
+    `geometry` has an extensor mechanism (its other muscle forces are not used), `lifted` the sides
+    without load.
 
     Raises:
         ComputationError: the patella was not found, or the equations are singular.
@@ -193,10 +193,9 @@ def flexion_row(
 def yielding_flexion_row(
     geometry: KneeGeometry, lines: CrossingLines, base: float, per_wrench: Array
 ) -> FlexionRow:
-    """Return the knee's row of the static optimisation if coordinates are released.
+    """Return the row if coordinates are released.
 
-    By the patella's equilibrium the tension of the extensor group is Q = a T + b, where T is the
-    tension of the patellar ligament.
+    By the patella's equilibrium Q = a T + b, with the tension T of the patellar ligament.
 
     `geometry` has an extensor mechanism; its contact is not used. `base` is T without the other
     muscles, N, and `per_wrench` (6,), 1 and 1/m, its change per wrench on the insert.
@@ -212,7 +211,7 @@ def yielding_flexion_row(
 
 
 def tension_by_ligament(geometry: KneeGeometry) -> tuple[float, float]:
-    """Return a (1) and b (N) of Q = a T + b from the three equations of the patella.
+    """Return a (1) and b (N) of Q = a T + b, by the three equations of the patella.
 
     A released patella has the ratio a of its equilibrium.
     """
@@ -242,22 +241,23 @@ def tension_by_ligament(geometry: KneeGeometry) -> tuple[float, float]:
 
 
 def _solved_for_reserve(constant: float, gains: Array, slope: float) -> FlexionRow:
-    """Return the row from Q = constant + gains F + slope r, solved for the reserve r."""
+    """Return the row of Q = constant + gains F + slope r."""
     return FlexionRow(-constant / slope, -1.0 / slope, np.asarray(gains / slope))
 
 
 EXTERNAL, LIGAMENTS, POST, EXTENSORS = "external", "ligaments", "post", "quadriceps"
-"""Names of the contributions of weight, inertia and ground reaction; of all ligaments; of a cam on
-the post; and of the extensor group."""
+"""Names of the contributions of weight, inertia and ground reaction, all ligaments, the post and
+the extensor group.
+"""
 
 
 def condyle_contributions(
     geometry: KneeGeometry, loads: SolvedLoads, friction: float
 ) -> dict[str, dict[str, float]]:
-    """Return side -> load -> its contribution to the normal force of that side, N.
+    """Return side -> load -> its contribution to that side's normal force, N.
 
-    They add up to that force; a lifted side has none. `geometry` has contact, extensor mechanism
-    and the other muscles.
+    They add up to the force; a lifted side has none. `geometry` has contact, extensor mechanism and
+    the other muscles.
     """
     share, extensor = geometry.share, geometry.extensor
     if share is None or extensor is None or loads.problems:

@@ -1,4 +1,4 @@
-"""The equations of one frame of the knee, which give all unknown loads from a known geometry.
+"""The equations of one frame of the knee, which give all unknown loads.
 
 The full model has 15 equations (6 of the free root, 6 of the knee, 3 of the patella) and 15
 unknowns: hip force and moment (6), one muscle, patellar ligament, patellofemoral force (2), medial
@@ -43,8 +43,7 @@ class EquationSettings:
     """Sensitivity of the loads to the residuals."""
 
     residual_shift: float = 0.010
-    """m: shift along y of the point where the residuals act, for the column
-    `residual_sensitivity_N`."""
+    """m: shift along y of the point where the residuals act (`residual_sensitivity_N`)."""
 
 
 EQUATION = EquationSettings()
@@ -55,16 +54,16 @@ PATELLAR = ("patellar_ligament", "patellofemoral", "patellofemoral_tangential")
 
 @dataclass(frozen=True, eq=False)
 class Extensor:
-    """The extensor mechanism at one frame, insert frame. Its tensions are unknown.
+    """The extensor mechanism, insert frame.
 
     Args:
-        patellar_ligament: loads on the links at a tension of one newton.
-        contact_point: point of patellofemoral contact, shape (3,), m.
+        patellar_ligament: loads on the links at one newton.
+        contact_point: point of patellofemoral contact, (3,), m.
         contact_normal: unit normal from femur to patella, in the sagittal plane, shape (3,).
-        muscles: names of the extensor group, the muscles that insert on the patella.
+        muscles: names of the muscles that insert on the patella.
         wrap: angle by which the extensor group wraps the femur, rad.
-        released: the released patella, whose contact force may leave the sagittal plane; None: the
-            patella moves in its plane.
+        released: patella whose contact force may leave the sagittal plane; None: it moves in its
+            plane.
     """
 
     patellar_ligament: tuple[PointForces, ...]
@@ -75,27 +74,25 @@ class Extensor:
     released: "PatellaLoads | None" = None
 
     def tension(self, values: Mapping[str, float]) -> float:
-        """Return the tension (N) of the extensor group among solved loads; NaN if unsolved."""
+        """Return the tension (N) of the extensor group; NaN if unsolved."""
         return sum(values.get(muscle_load(name), np.nan) for name in self.muscles)
 
 
 @dataclass(frozen=True, eq=False)
 class KneeGeometry:
-    """Input of the equations of one frame, insert frame.
+    """Input of the equations, insert frame.
 
     Args:
-        state: the chain at this frame.
         ground: ground reaction on the shank; None: not measured.
-        ligaments: loads of the ligaments on the links.
         condyles: side -> contact point; empty: contact is not modelled.
         lifted: sides that are lifted off the insert by their recorded gap.
-        extensor: the extensor mechanism; None: not modelled.
+        extensor: None: not modelled.
         muscles: the unknown tension of each muscle on its line of action.
-        coordinates: knee coordinates of this geometry, shape (6,), m and rad.
+        coordinates: knee coordinates of this geometry, (6,), m and rad.
         tensions: ligament name -> tension, N.
         share: the other muscles with their forces; None: not modelled.
         post: loads of a cam on the insert's post; empty: not modelled, or no contact.
-        problems: reasons why the equations cannot be set up; empty: they can.
+        problems: reasons why the equations cannot be set up.
     """
 
     state: ChainState
@@ -118,8 +115,7 @@ class SolvedLoads:
 
     Args:
         values: name of an unknown -> magnitude, N or N·m.
-        contact_force: force of the condyles on the femur without residuals, insert frame, shape
-            (3,), N.
+        contact_force: force of the condyles on the femur without residuals, insert frame, (3,), N.
         external_flexion: external flexion moment about the femoral ML axis, N·m.
         external_adduction: external adduction moment about the floating axis, N·m.
         sensitivity: largest change of the total contact force if the residuals act 10 mm higher
@@ -128,7 +124,7 @@ class SolvedLoads:
         lifted: sides that carry no load.
         slack: whether the extensor group carries no load, because it would have to push.
         ambiguous: whether a second load state also has all signs right.
-        problems: reasons why there is no solution; empty: there is a solution.
+        problems: reasons why there is no solution.
     """
 
     values: dict[str, float]
@@ -150,7 +146,6 @@ def solve_knee(geometry: KneeGeometry, friction: float) -> SolvedLoads:
     `ambiguous` is true. If every state has a wrong sign, there is no solution.
 
     Args:
-        geometry: the frame.
         friction: Coulomb coefficient of the femorotibial contact.
     """
     lifted = geometry.lifted
@@ -178,20 +173,14 @@ def solve_knee(geometry: KneeGeometry, friction: float) -> SolvedLoads:
 
 
 def solved_unknowns(geometry: KneeGeometry, loads: SolvedLoads, friction: float) -> list[Unknown]:
-    """Return the unknown loads of one frame in the load state of its solution.
-
-    Args:
-        geometry: the frame.
-        loads: solution of its equations, without problems.
-        friction: Coulomb coefficient of the femorotibial contact.
-    """
+    """Return the unknowns in the load state of a solution without problems."""
     extensors = geometry.extensor.muscles if geometry.extensor else ()
     slack = frozenset(extensors if loads.slack else ())
     return KneeSystem(geometry, friction, LoadState(loads.lifted, slack)).unknowns
 
 
 def unsolved(problems: Iterable[str]) -> SolvedLoads:
-    """Return the loads of a frame without a solution: NaN, with the reasons."""
+    """Return the loads of a frame without a solution."""
     nan = np.nan
     state = (frozenset[str](), False, False)
     return SolvedLoads({}, np.full(3, nan), nan, nan, nan, nan, *state, tuple(problems))
@@ -202,10 +191,9 @@ def dome_sensitivity(
 ) -> tuple[float, float] | None:
     """Return the change of muscle and patellofemoral force per height of the button, N/m.
 
-    The patellofemoral force passes through the contact of the button with the femur. The moment
-    arms about this line of action decide the ratio of muscle and patellar-ligament tension. A
-    button that is higher or lower on the patella (y axis) shifts the line sideways and changes the
-    arms. The position of the button is known to about a millimetre only.
+    The patellofemoral force passes through the button's contact, whose position on the patella is
+    known to about a millimetre. The moment arms about its line of action decide the ratio of muscle
+    and patellar-ligament tension. A higher or lower button (y axis) shifts the line sideways.
 
     Here the line is shifted along the patella's y axis, and the patella does not move. With the
     frame's equations A x = b the change is dx = -A⁻¹ dA x. On the shipped knee, from extension to
@@ -215,8 +203,6 @@ def dome_sensitivity(
 
     Args:
         geometry: the frame. A released patella is replaced by the plane one.
-        loads: solution of its equations.
-        friction: Coulomb coefficient of the femorotibial contact.
 
     Returns:
         Changes of the extensor group's tension and of the patellofemoral force, N/m; zero if the
@@ -248,11 +234,9 @@ def dome_sensitivity(
 
 
 class KneeSystem:
-    """The linear equations of one frame in one load state, and their solution.
+    """The linear equations of one load state, and their solution.
 
     Args:
-        geometry: the frame.
-        friction: Coulomb coefficient.
         assumed: the loads that are assumed to be zero.
     """
 
@@ -304,7 +288,7 @@ class KneeSystem:
         )
 
     def contact_force(self, values: Mapping[str, float]) -> Array:
-        """Return the femorotibial force on the femur (3,), insert frame, without residuals."""
+        """Return the force on the femur (3,), insert frame, without residuals."""
         if not self.geometry.condyles:
             return np.array([values[f"knee_force_{axis}"] for axis in unknowns.AXES])
         forces = [
@@ -342,9 +326,9 @@ class KneeSystem:
     def external_moments(self) -> tuple[float, float]:
         """Return the external flexion and adduction moments, N·m.
 
-        Hip, ground, gravity and inertia require generalised forces of the knee about its flexion
-        and adduction axes. The external moments are the negatives of these forces. The three axes
-        meet at the femoral origin, the centre of the knee.
+        They are the negatives of the generalised forces that hip, ground, gravity and inertia
+        require about the knee's flexion and adduction axes. The three axes meet at the femoral
+        origin, the centre of the knee.
         """
         hip = self._columns[:, :6]
         # The internal loads of the knee cancel in the six equations of the free root, so these

@@ -66,14 +66,12 @@ COUPLING = CouplingSettings()
 
 @dataclass(frozen=True, eq=False)
 class FrameStart:
-    """What a frame hands to the next one as initial guess.
+    """Initial guess for the next frame; None: there is none.
 
     Args:
-        contact: warm start of the contact model; None: there is none.
         equilibrium: equilibrium of the released coordinates; None: none are released, or the frame
             failed.
-        button: warm start of the button's contact; None: there is none.
-        patella: coordinates (6,) of the patella as a body; None: there are none.
+        patella: coordinates (6,) of the patella as a body.
     """
 
     contact: "WarmStart | None" = None
@@ -88,15 +86,14 @@ class Frame:
 
     Args:
         geometry: geometry in the equations of motion.
-        loads: solution of the equations.
         seconds: computing time of kinematics and equations, s.
         query_seconds: computing time of the closest points on the meshes, s.
         adjustment: femoral adjustment, after its check if there is a contact; None: not requested,
             or impossible.
-        effect: change of the forces by the adjustment; None without an adjustment, or without a
-            solution at the recorded pose.
+        effect: change of the forces by the adjustment; None also without a solution at the recorded
+            pose.
         contact: the contact; None: not modelled, or it could not be computed.
-        problem: reason why there is no contact; empty: there is one, or it is not modelled.
+        problem: reason why a modelled contact is missing; else empty.
         contact_seconds: computing time of the contact, s.
         iterations: iterations between loads and contact; 0: not coupled.
         load_change: change of the load in the last iteration, N.
@@ -105,9 +102,9 @@ class Frame:
         sensitivity: change of the medial force with adduction (`split_sensitivity`), N/rad; NaN:
             adduction is released, or there is one condyle.
         start: warm start of the next frame's contact; None: there is none.
-        medial: whether each map point lies under the medial condyle, shape (n,); None: there is no
+        medial: whether each map point lies under the medial condyle, (n,); None: there is no
             contact.
-        triangles: triangles of the map, shape (k, 3); None: there is no contact.
+        triangles: triangles of the map, (k, 3); None: there is no contact.
         post: contact of cam and post; None: not modelled.
         button: the button pressed on the femoral component; None: not modelled, or the frame
             failed.
@@ -155,9 +152,9 @@ class Frame:
         return list(self.loads.problems) or ([self.problem] if self.problem else [])
 
     def area_above(self, side: str, pressure: float) -> float:
-        """Return the share of a condyle's contact area above a pressure (Pa), 1 at most.
+        """Return the share of a condyle's contact area above a pressure (Pa), at most 1.
 
-        The pressure is linear between the map points, see `tkamb.contact.area.area_above`.
+        See `tkamb.contact.area.area_above`.
         """
         condyle = getattr(self.contact, side, None)
         if self.contact is None or condyle is None:
@@ -173,7 +170,7 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class FrameMethod:
-    """How the frames of a knee are computed. The contact is prepared at its first use.
+    """The contact is prepared at its first use.
 
     Args:
         knee: a knee of a right leg.
@@ -258,7 +255,7 @@ class FrameMethod:
         """Return loads and contacts at an instant.
 
         Args:
-            before: starts of the earlier frames, for warm start and initial guess.
+            before: starts of the earlier frames.
         """
         last = before[-1] if before else FrameStart()
         instant = replace(instant, patella_start=last.patella)
@@ -280,7 +277,6 @@ class FrameMethod:
         return replace(frame, button=button.pressed(femur, patella, force, last.button))
 
     def _knee_frame(self, instant: Instant, before: Sequence[FrameStart]) -> Frame:
-        """Return loads and femorotibial contact at an instant."""
         if self.knee.contact is None:
             return self.loads(instant)
         if self.released:
@@ -302,7 +298,7 @@ class FrameMethod:
         return replace(frame, sensitivity=sensitivity, contact_seconds=seconds)
 
     def loads(self, instant: Instant, adjustment: "Adjustment | None" = None) -> Frame:
-        """Return the loads at an instant by the equations alone; NaN without a solution.
+        """Return the loads by the equations alone; NaN without a solution.
 
         Args:
             adjustment: femoral adjustment; None: computed if the method has one.
@@ -326,7 +322,7 @@ class FrameMethod:
         return Frame(geometry, loads, end - query_end, query_end - began, adjustment, effect)
 
     def _adjust(self, pose: Array) -> "tuple[Adjustment | None, tuple[str, ...]]":
-        """Return the femoral adjustment, if the method has one, and reasons for its failure."""
+        """Return the adjustment, if the method has one, and reasons for its failure."""
         if self.knee.contact is None or self.adjust is None:
             return None, ()
         from tkamb.geometry.adjustment import adjust
@@ -342,7 +338,6 @@ class FrameMethod:
         return instant.contact_points(self.knee._query, pose)
 
     def _press_recorded(self, instant: Instant, before: Sequence[FrameStart]) -> Frame:
-        """Return loads and contact at the recorded rotation."""
         from tkamb.geometry.threads import both
 
         start = before[-1].contact if before else None
@@ -359,14 +354,11 @@ class FrameMethod:
         return self._couple(instant, body, frame)
 
     def _pressed(self, body: Frame, pose: Array, start: "WarmStart | None") -> Frame:
-        """Return a frame with the contact under the load of its equations.
-
-        The rotation is the recorded one or, with an adjustment, the adjusted one.
+        """The rotation is the recorded one or, with an adjustment, the adjusted one.
 
         Args:
-            body: loads of the frame by the equations, with the adjustment before its check.
+            body: loads by the equations, with the adjustment before its check.
             pose: recorded pose_femoral_in_insert, (4, 4).
-            start: warm start of the previous frame; None: no warm start.
         """
         load = float(body.loads.contact_force[1])
         if not np.isfinite(load):
@@ -388,14 +380,13 @@ class FrameMethod:
         return self._touched(body, result, start)
 
     def _couple(self, instant: Instant, body: Frame, frame: Frame) -> Frame:
-        """Iterate between equations and contact.
+        """Iterate between equations and contact, until both converge.
 
         The resultants of the contact (if coupled) and the post force act on the body. Each press
         checks the adjustment anew.
 
         Args:
             body: loads by the equations, with the adjustment before its check.
-            frame: the same loads with the contact under them.
         """
         seconds, place = frame.contact_seconds, instant.coordinates
         for iteration in range(1, COUPLING.max_iterations + 1):
@@ -428,10 +419,7 @@ class FrameMethod:
         return _without_contact(frame, "the iteration of body and contact does not converge")
 
     def _release(self, instant: Instant, before: Sequence[FrameStart]) -> Frame:
-        """Return loads and contact with the released coordinates in equilibrium.
-
-        The initial guess extrapolates the last three equilibria of `before`.
-        """
+        """The initial guess extrapolates the last three equilibria of `before`."""
         began = clock.perf_counter()
         # A frame that failed has no equilibrium: the guess skips it.
         good = [each for each in before if each.equilibrium][-3:]
@@ -490,7 +478,7 @@ class FrameMethod:
         contact: "ContactResult",
         points: dict[str, Array],
     ) -> KneeGeometry:
-        """Return the geometry of the equations, with the resultants of condyles and post."""
+        """Return the geometry with the resultants of condyles and post."""
         from tkamb.contact.model import condyle_wrenches
 
         condyles, place = condyle_wrenches(contact, self._contact.pair.split), knee.coordinates
@@ -500,17 +488,13 @@ class FrameMethod:
         )
 
     def _resultants(self, instant: Instant, result: "ContactResult") -> dict[str, CondylePoint]:
-        """Return the contact's resultants as the contact points of the equations."""
         from tkamb.contact.model import condyle_wrenches
 
         condyles = condyle_wrenches(result, self._contact.pair.split)
         return instant.resultants(instant.coordinates, condyles)
 
     def _post_contact(self, pose: Array) -> "PostContact | None":
-        """Return the contact of cam and post at a pose (4, 4); None: not modelled.
-
-        The result has a flag if cam and post overlap at a recorded AP position.
-        """
+        """The result has a flag if cam and post overlap at a recorded AP position."""
         if self.cam is None:
             return None
         post = self.cam.at(pose)
@@ -545,7 +529,7 @@ class FrameMethod:
 def _effect(
     geometry: KneeGeometry, loads: SolvedLoads, recorded: ContactPoints, friction: float
 ) -> "AdjustmentEffect | None":
-    """Return the change by the adjustment; None: one of the two poses has no solution."""
+    """Return None if one of the two poses has no solution."""
     if loads.problems or recorded.problems:
         return None
     from tkamb.knee.adjustment import adjustment_effect
@@ -558,12 +542,11 @@ def _effect(
 
 
 def _without_contact(frame: Frame, problem: str) -> Frame:
-    """Return a frame without loads and contact, with the reason."""
     return replace(frame, loads=unsolved([problem]), contact=None, problem=problem)
 
 
 def _equilibrium_flags(knee: "KneeEquilibrium") -> tuple[str, ...]:
-    """Return the flags of an equilibrium: a second equilibrium, an inaccurate compliance."""
+    """Return flags for a second equilibrium and an inaccurate compliance."""
     second = (knee.second,) if knee.second else ()
     if knee.compliance_error <= COUPLING.stiffness_error:
         return second
@@ -580,5 +563,5 @@ def _points(frame: Frame) -> dict[str, Array]:
 
 
 def _travel(before: dict[str, Array], after: dict[str, Array]) -> float:
-    """Return the largest distance, m, by which a contact point has moved."""
+    """Return the largest distance, m, between matching points."""
     return max(float(np.linalg.norm(after[side] - before[side])) for side in after)

@@ -1,7 +1,7 @@
 """A knee at one instant: geometry, contact points and loads, at q or at other knee coordinates.
 
-The motion of the shank depends on q, v and a alone. The wrench that the knee must exert on the
-shank is therefore computed only once in a search over knee coordinates.
+The motion of the shank depends on q, v and a alone, so the wrench that the knee must exert on it is
+computed once in a search over knee coordinates.
 """
 
 from collections.abc import Callable, Mapping
@@ -32,12 +32,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class ContactPoints:
-    """The femorotibial contact of one pose, as input of the equations.
+    """The femorotibial contact of one pose.
 
     Args:
         condyles: side -> contact point; empty: contact is not modelled.
         lifted: sides that are lifted off the insert.
-        problems: reasons why the pose cannot be used; empty: it can be used.
+        problems: reasons why the pose cannot be used.
     """
 
     condyles: dict[str, CondylePoint]
@@ -46,7 +46,7 @@ class ContactPoints:
 
 
 NO_CONTACT = ContactPoints({}, frozenset(), ())
-"""Contact points of a frame in which contact is not modelled."""
+"""Contact is not modelled."""
 
 
 class PatellaFinder(Protocol):
@@ -59,16 +59,16 @@ class PatellaFinder(Protocol):
     def patella(
         self, pose: Array | None = None, guess: "PatellaState | None" = None
     ) -> "PatellaState":
-        """Return the patella with the femur at a pose (4, 4); None: at the pose of q."""
+        """Return the patella with the femur at a pose (4, 4); None: that of q."""
 
 
 class SharingMuscles(Protocol):
-    """Muscles of a leg that share the load of one instant with the knee."""
+    """Muscles of a leg that share the load with the knee."""
 
     def share(
         self, geometry: KneeGeometry, friction: float, lifted: frozenset[str]
     ) -> "MuscleShare":
-        """Return the force of each muscle at a fixed pose of the knee."""
+        """Return the muscle forces at a fixed pose of the knee."""
 
     def share_of_yielding_knee(
         self,
@@ -77,7 +77,7 @@ class SharingMuscles(Protocol):
         per_wrench: Array,
         points: Mapping[str, Array] | None = None,
     ) -> "MuscleShare":
-        """Return the force of each muscle; the released coordinates depend on these forces."""
+        """Return the muscle forces, on which the released coordinates depend."""
 
     def at(self, share: "MuscleShare") -> "MuscleShare":
         """Return the forces of a share with the lines of action of this instant."""
@@ -94,10 +94,9 @@ class PatellaAt:
     """Finds the patella of one instant, from its coordinates in q or by equilibrium.
 
     Args:
-        lines: the extensor mechanism.
-        pose: pose of the femur in the insert frame at q, shape (4, 4).
-        coordinates: patella coordinates of q, shape (3,), m and rad; None: q has none.
-        solved: True: the patella is solved again at other poses. False: it is fixed to the femur.
+        pose: femur in the insert frame at q, (4, 4).
+        coordinates: patella coordinates of q, (3,), m and rad; None: q has none.
+        solved: whether it is solved again at other poses, or fixed to the femur.
     """
 
     lines: "ExtensorLines"
@@ -108,7 +107,7 @@ class PatellaAt:
     def patella(
         self, pose: Array | None = None, guess: "PatellaState | None" = None
     ) -> "PatellaState":
-        """Return the patella with the femur at a pose (4, 4); None: at the pose of q."""
+        """Return the patella with the femur at a pose (4, 4); None: that of q."""
         pose = self.pose if pose is None else pose
         if self.coordinates is None:
             return self.lines.solved(pose, guess)
@@ -119,18 +118,14 @@ class PatellaAt:
 
 @dataclass(frozen=True, eq=False)
 class Instant:
-    """A knee at one instant.
+    """A knee at one instant; wrenches (6,) are in the insert frame.
 
     Args:
-        chain: the canonical chain.
-        motion: motion of the chain.
-        shank: wrench that inertia and weight of the shank require, shape (6,), insert frame.
-        thigh: external wrench on the thigh, shape (6,), insert frame.
-        on_patella: external wrench on the patella, shape (6,), insert frame.
+        shank: wrench that inertia and weight of the shank require, (6,), insert frame.
+        thigh: external wrench on the thigh, (6,), insert frame.
         ligaments: ligament bundles, with ends on links of the chain.
         extensor: object that finds the patella; None: not modelled.
         friction: Coulomb coefficient.
-        two_condyles: whether the femoral component has two condyles.
         ground: external load on the shank; None: no load.
         muscles: muscles of the leg that share the load; None: the quadriceps alone acts.
         patella: how the released patella is found; None: the patella moves in its plane.
@@ -168,7 +163,7 @@ class Instant:
         """Return the knee without its contact.
 
         Args:
-            coordinates: knee coordinates, shape (6,), m and rad; None: those of q.
+            coordinates: knee coordinates, (6,), m and rad; None: those of q.
             patella: the patella; None: `extensor` finds it.
         """
         knee_coordinates = self.coordinates if coordinates is None else coordinates
@@ -211,7 +206,7 @@ class Instant:
         return replace(geometry, extensor=extensor, muscles=(muscle,))
 
     def _pulls(self, state: "ChainState") -> tuple[dict[str, float], tuple[PointForces, ...]]:
-        """Return ligament -> tension (N), and the ligaments' loads on the links."""
+        """Return ligament -> tension (N), and the loads on the links."""
         if not self.ligaments:
             return {}, ()
         from tkamb.knee.ligaments import ligament_loads
@@ -222,7 +217,7 @@ class Instant:
         return dict(zip(names, tensions.tolist(), strict=True)), loads
 
     def contact_points(self, query: "ClosestPointQuery", pose: Array) -> ContactPoints:
-        """Return the contact points of the undeformed bodies at a pose (4, 4)."""
+        """Return the undeformed bodies' contact points at a pose (4, 4)."""
         return contact_points(query, pose, lambda point: self.sliding(self.coordinates, point))
 
     def solved(self, geometry: KneeGeometry) -> tuple[KneeGeometry, SolvedLoads]:
@@ -238,7 +233,7 @@ class Instant:
         return self.patella.solved(geometry, self._solved, self.patella_start)
 
     def solved_with_muscles(self, geometry: KneeGeometry) -> tuple[KneeGeometry, SolvedLoads]:
-        """Return a geometry with its released patella, and its loads; muscle forces are kept.
+        """Return a geometry with its released patella, and its loads.
 
         Args:
             geometry: result of `geometry`, with contact points and muscle forces.
@@ -259,11 +254,11 @@ class Instant:
     def sliding(self, coordinates: Array, point: Array) -> Array:
         """Return the velocity (3,), m/s, of a point of the femur relative to the insert.
 
-        The rates of the knee coordinates are those of q and v.
+        The rates are those of q and v.
 
         Args:
-            coordinates: knee coordinates, shape (6,), m and rad.
-            point: position, insert frame, shape (3,), m.
+            coordinates: knee coordinates, (6,), m and rad.
+            point: position, insert frame, (3,), m.
         """
         velocity, spin = knee_twist(coordinates, self.motion.joints[1, :6])
         return np.asarray(velocity + cross(spin, point - coordinates[:3]))
@@ -271,10 +266,9 @@ class Instant:
     def resultants(
         self, coordinates: Array, condyles: "Mapping[str, CondyleWrench]"
     ) -> dict[str, CondylePoint]:
-        """Return the resultants of a contact as the contact points of the equations.
+        """Return a contact's resultants as contact points of the equations.
 
         Args:
-            coordinates: knee coordinates, shape (6,), m and rad.
             condyles: side -> load on the insert at these coordinates.
         """
         return {
@@ -291,11 +285,10 @@ class Instant:
         condyles: "Mapping[str, CondyleWrench]",
         points: Mapping[str, Array],
     ) -> KneeGeometry:
-        """Return a geometry with the resultants of a contact as its contact points.
+        """Return a geometry with a contact's resultants as its contact points.
 
         Args:
-            geometry: result of `geometry`.
-            coordinates: knee coordinates, shape (6,), m and rad.
+            coordinates: knee coordinates, (6,), m and rad.
             condyles: loaded side -> its load on the insert at these coordinates.
             points: side -> point (3,), m, where an unloaded condyle is nearest to the insert.
         """
@@ -311,10 +304,9 @@ class Instant:
     def post_loads(
         self, coordinates: Array, post: "CondyleWrench | None"
     ) -> tuple[PointForces, ...]:
-        """Return the loads of cam and post on tibia and femur, including friction.
+        """Return the loads on tibia and femur, including friction.
 
         Args:
-            coordinates: knee coordinates, shape (6,), m and rad.
             post: load of the cam on the insert at these coordinates; None: no contact.
         """
         if post is None:
@@ -336,7 +328,7 @@ def contact_points(
     """Return the contact points of a pose.
 
     Args:
-        pose: pose_femoral_in_insert, shape (4, 4).
+        pose: pose_femoral_in_insert, (4, 4).
         sliding: function of a point (3,), m, insert frame. It returns the velocity (3,), m/s, of
             the femur relative to the insert at that point.
     """

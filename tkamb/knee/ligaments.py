@@ -1,7 +1,5 @@
 """Ligament bundles: straight or wrapping lines between two links that pull and never push.
 
-`tkamb.knee.ligament_laws` has the laws: tension by length.
-
 `generic_ligaments` scales a set of bundles to the implant, for a patient without measured
 ligaments. Femoral ends are relative to the axis of the posterior condyles, near which collaterals
 are nearly isometric. The proportions are those of an average knee: check the strain table before
@@ -76,7 +74,7 @@ class Ligament:
 
     @property
     def links(self) -> tuple[str, ...]:
-        """Names of the links of both ends and of the surfaces, each once."""
+        """Names of the links of ends and surfaces, each once."""
         bodies = (wrap.body for wrap in self.wraps)
         return tuple(dict.fromkeys((self.proximal.link, self.distal.link, *bodies)))
 
@@ -127,11 +125,10 @@ DIFFERENCE_ARM = 0.03
 
 @dataclass(frozen=True, eq=False)
 class BundleArrays:
-    """Bundles between two bodies: arrays of m straight bundles, and the bundles that wrap.
+    """m straight bundles between two bodies as arrays, and the bundles that wrap.
 
     Args:
         proximal: proximal ends in one frame, (m, 3), m.
-        distal: distal ends in one frame, (m, 3), m.
         slack_length: slack lengths, (m,), m.
         wrapping: bundles that wrap, with the links `PROXIMAL` and `DISTAL`.
     """
@@ -153,7 +150,7 @@ class BundleArrays:
 
     @classmethod
     def of(cls, bundles: Sequence[Ligament], proximal: Array, distal: Array) -> "BundleArrays":
-        """Return the arrays of straight bundles with the given ends (m, 3), m."""
+        """Return the arrays of straight bundles with given ends (m, 3), m."""
         return cls(
             proximal.reshape(-1, 3),
             distal.reshape(-1, 3),
@@ -172,8 +169,8 @@ class BundleArrays:
         """Return the derivative (6, 6) of `wrench` by a small displacement of the proximal body.
 
         The pull T u on a distal end changes by (T/L (I - u u^T) + T' u u^T) dx, with the
-        displacement dx of the proximal end, the length L and the slope T' of the law. Bundles that
-        wrap have central differences. `pose` is that of the proximal frame in the distal frame.
+        displacement dx of the proximal end, the length L and the law's slope T'. Bundles that wrap
+        have central differences. `pose` is of the proximal in the distal frame.
         """
         proximal = transform(pose, self.proximal)
         along = proximal - self.distal
@@ -197,7 +194,7 @@ class BundleArrays:
     def wrench(self, poses: Array) -> Array:
         """Return the wrench (..., 6) on the distal body, about its frame's origin.
 
-        `poses` (..., 4, 4) are those of the proximal frame in the distal frame.
+        `poses` (..., 4, 4) are of the proximal in the distal frame.
         """
         proximal = self.proximal @ poses[..., :3, :3].swapaxes(-1, -2) + poses[..., None, :3, 3]
         _, pull = self.pulls(proximal, self.distal)
@@ -222,8 +219,8 @@ def ligament_loads(
 ) -> tuple[Array, tuple[PointForces, ...]]:
     """Return the tensions (n,), N, and the loads on the links; their sum is zero.
 
-    There is one load per link for all straight bundles, and one for all that wrap. `poses` (4, 4)
-    are in the insert frame.
+    All straight bundles give one load per link, all that wrap another. `poses` (4, 4) are in the
+    insert frame.
 
     Raises:
         ComputationError: a bundle has no taut path over its surfaces.
@@ -310,7 +307,7 @@ def _with_slack_length(bundle: Ligament, poses: Mapping[str, Array], flexion: Ar
 
 
 def nearest_frame(flexion: Array, target: float) -> int:
-    """Return the index of the flexion (f,), rad, that is nearest to a target, rad."""
+    """Return the index of the flexion (f,), rad, nearest to a target."""
     return int(np.nanargmin(np.abs(flexion - target)))
 
 
@@ -321,12 +318,12 @@ def strain_table(
     at_deg: Sequence[float] = (0.0, 60.0, 90.0),
     within_deg: float = 10.0,
 ) -> dict[str, tuple[float, ...]]:
-    """Return the strain of each bundle at a few flexions. An unlikely strain reveals a wrong end.
+    """Return each bundle's strain at a few flexions; an unlikely one reveals a wrong end.
 
     Args:
         poses: link -> pose_link_in_insert (f, 4, 4).
         flexion: flexion in these frames, (f,), rad.
-        at_deg: flexions at which the strain is computed, in the nearest recorded frame, deg.
+        at_deg: flexions, deg, of which the nearest recorded frame is taken.
         within_deg: largest difference of that frame's flexion, deg; beyond it the strain is NaN.
     """
     frames = [nearest_frame(flexion, angle * DEGREE) for angle in at_deg]
@@ -367,8 +364,8 @@ _LATERAL = re.compile(
 def check_collateral_sides(ligaments: Iterable[Ligament], chain: Chain, side: str) -> None:
     """Raise an error if a ligament's name and its position belong to different sides of the knee.
 
-    The bundles are those of a right knee or of a mirrored left one: z points laterally. `side` is
-    that of the patient's knee, for the message.
+    z points laterally: the knee is a right or a mirrored left one. `side` is that of the patient's
+    knee, for the message.
     """
     for bundle in ligaments:
         sign = _lateral_sign(bundle.name)
@@ -386,7 +383,7 @@ def check_collateral_sides(ligaments: Iterable[Ligament], chain: Chain, side: st
 
 
 def _lateral_sign(name: str) -> int:
-    """Return -1 if the name is that of a medial ligament, 1 if of a lateral ligament, else 0."""
+    """Return -1 for the name of a medial ligament, 1 for a lateral one, else 0."""
     medial, lateral = bool(_MEDIAL.search(name)), bool(_LATERAL.search(name))
     return int(lateral) - int(medial)
 
@@ -404,7 +401,7 @@ PREFIX = "generic_"
 
 @dataclass(frozen=True)
 class _Bundle:
-    """One bundle of `BUNDLES`; the strain is that in extension."""
+    """The strain is that in extension."""
 
     proximal: tuple[float, float, float]
     distal: tuple[float, float, float]
@@ -473,12 +470,12 @@ def generic_ligaments(
 
 
 def condylar_axis(femoral: Surface) -> Array:
-    """Return the centre (3,) of the circle that fits the posterior condyles, m.
+    """Return the centre (3,), m, of the circle that fits the posterior condyles, on an axis
+    parallel to z.
 
-    The axis is parallel to z. At a flexion phi let u be downward in the femur's frame. The support,
-    the maximum of u . p over the vertices p, is u . c + r for a circle of centre c and radius r;
-    least squares fit c and r to those at 20 to 100 deg. The z of the centre is the middle of the
-    component's width.
+    At a flexion phi let u be downward in the femur's frame. The support, the maximum of u . p over
+    the vertices p, is u . c + r for a circle of centre c and radius r; least squares fit c and r to
+    those at 20 to 100 deg. The z of the centre is the middle of the component's width.
     """
     flexion = np.deg2rad(np.arange(20.0, 101.0, 5.0))
     down = np.column_stack([-np.sin(flexion), -np.cos(flexion)])

@@ -19,9 +19,8 @@ moment:
           lambda g_l + (1 - lambda) g_r + (c/2) n_z² + (d/2) a²
     n_z = lambda n_lz + (1 - lambda) n_rz      a = lambda z_l + (1 - lambda) z_r
 
-where z is measured from the patella's middle. The sagittal part of lambda n_l + (1 - lambda) n_r is
-the direction of the force. Shift and tilt are first-order estimates: the computed patella stays in
-the sagittal plane.
+where z is measured from the patella's middle. The sagittal part of n is the direction of the force.
+Shift and tilt are first-order estimates: the computed patella stays in the sagittal plane.
 """
 
 import copy
@@ -44,23 +43,28 @@ class PatellofemoralSettings:
     """m: tau of the module's equations. A contact of relative radius R is averaged over a radius of
     about sqrt(R tau). Larger: smoother, less local."""
     sample_spacing: float = 1e-3
-    """m: spacing of the button's samples in the patella's coronal plane. Chosen because the facets
-    of a mesh have about this size."""
+    """m: spacing of the button's samples in the patella's coronal plane. The facets of a mesh have
+    about this size.
+    """
     sample_range: float = 14.0 * patch_depth
-    """m: excess over the smallest distance above which a sample has no weight. Chosen because the
-    weight at this excess is exp(-14) = 8e-7: the gap of a patch of twenty samples jumps by 3e-11 m
-    when a sample loses its weight."""
+    """m: excess over the smallest distance above which a sample has no weight. The weight at this
+    excess is exp(-14) = 8e-7: the gap of a patch of twenty samples jumps by 3e-11 m when a sample
+    loses its weight.
+    """
     coarse_samples: int = 60
-    """Number of samples of the quick check for touch. Not studied."""
+    """Samples of the quick check for touch. Not studied."""
     lateral_compliance: float = 0.01
-    """m: c of the module's equations, the shift under a purely lateral contact force. Chosen soft
-    enough for a smooth search."""
+    """m: c of the module's equations, the shift under a purely lateral contact force. It is soft
+    enough for a smooth search.
+    """
     tilt_compliance: float = 10.0
-    """rad/m: d of the module's equations. A force 10 mm beside the middle tilts by 5.7 deg. Chosen
-    soft enough for a smooth search."""
+    """rad/m: d of the module's equations. A force 10 mm beside the middle tilts by 5.7 deg. It is
+    soft enough for a smooth search.
+    """
     least_sagittal_part: float = 1e-9
-    """1: sagittal part of a unit normal below which the normal has no sagittal direction. Chosen
-    because it is above rounding errors."""
+    """1: sagittal part of a unit normal below which the normal has no sagittal direction. It is
+    above rounding errors.
+    """
 
 
 PATELLOFEMORAL = PatellofemoralSettings()
@@ -78,7 +82,7 @@ EDGE_MARGIN = 0.02
 
 @dataclass(frozen=True, eq=False)
 class PatellarContact:
-    """The contact at one position of the patella, in the patellar joint's frame.
+    """The contact at one position, in the patellar joint's frame.
 
     Args:
         gap: gap, negative in penetration, m.
@@ -99,7 +103,7 @@ class PatellarContact:
 
 
 class PatellofemoralContact:
-    """Contact between button and femoral component, prepared for many positions.
+    """Contact between button and femoral component.
 
     The distance of a sample is computed again only if it can have a weight; the result does not
     change.
@@ -162,7 +166,7 @@ class PatellofemoralContact:
         return PatellarContact(gap, contact[5:8], contact[8:], left_share, shift, tilt, on_edge)
 
     def touches(self, coordinates: Array) -> bool:
-        """Return whether any of a few samples lies inside the femur, as a quick check."""
+        """Return whether any of a few samples lies inside the femur."""
         subset = self._samples[:: max(1, len(self._samples) // PATELLOFEMORAL.coarse_samples)]
         samples = transform(self.pose(np.asarray(coordinates, float)), subset)
         low, high = self._nearest.surface.bounds
@@ -173,7 +177,7 @@ class PatellofemoralContact:
         return bool((heights < 0.0).any())
 
     def _sides_at(self, coordinates: Array) -> Array:
-        """Return gap, point, normal and share on edges of the left and the right side (2, 8)."""
+        """Return gap, point, normal and share on edges, left and right (2, 8)."""
         samples = transform(self.pose(np.asarray(coordinates, float)), self._samples)
         last_position, distance = self._stored[:2]
         indices = _samples_to_update(
@@ -209,10 +213,10 @@ def _samples_to_update(
     last_position: Array,
     distance: Array,
 ) -> Index:
-    """Return the indices of the samples whose distances must be computed again.
+    """Return the samples whose distances must be computed again.
 
-    A distance d at the last evaluation is now between d - m and d + m, with the displacement m
-    since then. These bounds exclude samples without weight.
+    With the displacement m since its last evaluation a distance d is now between d - m and d + m,
+    which excludes samples without weight.
 
     Args:
         samples: present positions of the samples, (n, 3), m.
@@ -253,7 +257,7 @@ def _store_samples(
     normal: Array,
     on_edge: Array,
 ) -> None:
-    """Store the distances, nearest points and normals of m of the n samples.
+    """Store distances, nearest points and normals of m of the n samples.
 
     Args:
         indices: indices of the samples, (m,).
@@ -298,10 +302,9 @@ def _mean_over_sides(
     on_edge: Array,
     means: Array,
 ) -> None:
-    """Compute g, p, n and the share on edges of the left and the right side.
+    """Compute g, p, n and the share on edges, left and right, into `means` (2, 8).
 
-    `depth` is tau; `on_edge` is 1 at a nearest point on a sharp or open edge, else 0, (n,); `means`
-    (2, 8) is the output.
+    `depth` is tau; `on_edge` (n,) is 1 at a nearest point on a sharp or open edge, else 0.
     """
     for side in range(2):
         nearest, total = np.inf, 0.0
@@ -328,7 +331,7 @@ def _mean_over_sides(
 
 @compiled_as_written
 def _contact_of_sides(sides: Array, middle: float, compliances: Array, contact: Array) -> float:
-    """Compute the contact by the module's equations, and return the normal's sagittal part.
+    """Compute the contact by the module's equations; return the normal's sagittal part.
 
     Args:
         sides: gap, point, normal and share on edges of the left and the right side, (2, 8).
@@ -373,7 +376,7 @@ def _contact_of_sides(sides: Array, middle: float, compliances: Array, contact: 
 
 
 def _joint_side(patellar: Surface) -> Array:
-    """Return samples (n, 3), m, of the articular side, by rays along the patella's +x."""
+    """Return samples (n, 3), m, by rays along the patella's +x."""
     low, high = patellar.bounds
     axes = [
         np.arange(

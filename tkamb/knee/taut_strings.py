@@ -23,8 +23,8 @@ where u_P and u_Q are the string's directions at P and Q. The force on the point
 For several objects, the touching points on one object after the other are updated until none moves.
 Then every straight part is tangent to the objects at its ends: the string is taut.
 
-A string of unit tension exerts forces on each path point, and on each wrap object where it meets
-and leaves it. They balance.
+A string of unit tension exerts balanced forces on each path point, and on each wrap object where it
+meets and leaves it.
 """
 
 from collections.abc import Sequence
@@ -85,7 +85,7 @@ def _no_push(start: Array) -> Array:
 
 
 def _polar(points: Array) -> tuple[Array, Array]:
-    """Return distances (f,), m, from the z axis and polar angles (f,), rad, of points (f, 3), m."""
+    """Return distances (f,), m, from the z axis and polar angles (f,), rad."""
     return np.hypot(points[:, 0], points[:, 1]), np.arctan2(points[:, 1], points[:, 0])
 
 
@@ -96,10 +96,8 @@ def _wrapped(angles: Array) -> Array:
 def _around(
     distances: tuple[Array, Array], sweep: Array, radius: float
 ) -> tuple[Array, Array, tuple[Array, Array]]:
-    """Return a taut string around a circle.
-
-    `distances` (f,), m, of start and end are from the centre; `sweep` (f,), rad, is the signed
-    angle about it from start to end, on the string's side.
+    """`distances` (f,), m, of a string's ends are from the centre of a circle; `sweep` (f,), rad,
+    is the signed angle about it from start to end, on the string's side.
 
     Returns:
         Signed angle of the arc (f,), rad, zero if the string does not touch; angle (f,) from the
@@ -115,10 +113,7 @@ def _around(
 def _cylinder(
     start: Array, end: Array, radius: float, length: float, quadrant: tuple[int, int] | None
 ) -> WrapTouch:
-    """Return strings around a cylinder along z.
-
-    A string does not touch if both touching points lie beyond the ends of the cylinder.
-    """
+    """A string does not touch if both touching points lie beyond the ends of the cylinder."""
     (near, angle), (far, last) = _polar(start), _polar(end)
     if quadrant is None or quadrant[0] == 2:
         sweep = _wrapped(last - angle)
@@ -142,7 +137,7 @@ def _cylinder(
 
 
 def _sphere(start: Array, end: Array, radius: float, quadrant: tuple[int, int] | None) -> WrapTouch:
-    """Return strings around a sphere, each in the plane of its ends and the centre.
+    """The strings lie in the plane of their ends and the centre.
 
     If the short way passes on the half that is not prescribed, a string takes the long way, unless
     both of its ends lie on the prescribed half.
@@ -211,7 +206,7 @@ def _torus(start: Array, end: Array, ring: float, tube: float) -> WrapTouch:
     rows = np.arange(len(start))
 
     def at(places: Array) -> tuple[WrapTouch, Array, Array]:
-        """Return touching points, lengths (f,), m, and frames of cylinders at angles (f,), rad."""
+        """Return touching points, lengths (f,), m, and cylinder frames at angles (f,), rad."""
         inward = -np.column_stack([np.cos(places), np.sin(places), np.zeros_like(places)])
         up = np.broadcast_to([0.0, 0.0, 1.0], inward.shape)
         frame = np.stack([inward, up, np.cross(inward, up)], axis=1)
@@ -241,7 +236,7 @@ def _torus(start: Array, end: Array, ring: float, tube: float) -> WrapTouch:
 def _ellipsoid(
     start: Array, end: Array, axes: Array, quadrant: tuple[int, int] | None, moves: Mask
 ) -> WrapTouch:
-    """Return strings around an ellipsoid. A string touches if its straight line would cut it."""
+    """A string touches if its straight line would cut the ellipsoid."""
     p, q = start / axes, end / axes
     depth = np.stack([np.linalg.norm(p, axis=1), np.linalg.norm(q, axis=1)], axis=1)
     size = np.where(moves, depth / (1.0 + ELLIPSOID_CLEARANCE), 1.0).min(axis=1)
@@ -281,13 +276,12 @@ TOLERANCE = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class WrappedStrings:
-    """f strings over w objects.
-
-    Args:
-        order: indices of the objects that a string touches, from start to end, then -1, (f, w).
-        entry: points where the strings meet the objects, m, (f, w, 3); they leave at `exit`.
-        arc_m: lengths on the objects, m, (f, w); NaN if the iteration has not converged.
-        push: force of a shrinking object on start and end, per unit tension, (f, w, 2, 3).
+    """Args:
+    order: indices of the objects that each of f strings touches, from start to end, then -1,
+        (f, w).
+    entry: points where the strings meet the objects, m, (f, w, 3); they leave at `exit`,
+        `arc_m` (f, w), m, later (NaN: not converged).
+    push: force of a shrinking object on start and end, per unit tension, (f, w, 2, 3).
     """
 
     order: Index
@@ -308,7 +302,7 @@ def strings_over(
     """Return the taut strings between points, over the objects between them.
 
     Args:
-        wraps: w objects, in the order in which they are tried.
+        wraps: w objects, tried in this order.
         poses: of the objects in the frame of the points, (f, w, 4, 4).
         allowed: whether a string may touch an object, (f, w).
         moves: whether start and end belong to another body than object w, (f, w, 2).
@@ -371,7 +365,7 @@ class _Strings:
         self.entry, self.exit = points[..., :3].copy(), points[..., 3:].copy()
 
     def sweep(self, rows: Index, allowed: Mask) -> None:
-        """Update the touching points of some strings on each allowed object (f, w) in turn."""
+        """Update the touching points on each allowed object (f, w) in turn."""
         for w in range(len(self.wraps)):
             self.remove(w, rows)
             self.insert(w, rows[allowed[rows, w]])
@@ -382,7 +376,7 @@ class _Strings:
         self.order[rows] = np.take_along_axis(order, closed, axis=1)
 
     def insert(self, w: int, free: Index) -> None:
-        """Wrap some strings around object w, in the first straight part that meets it."""
+        """Wrap strings around object w, in the first straight part that meets it."""
         for gap in range(len(self.wraps)):
             free = free[(self.order[free] >= 0).sum(axis=1) >= gap]
             if not len(free):
@@ -411,7 +405,7 @@ class _Strings:
 
 
 def _moved(poses: Array, points: Array) -> Array:
-    """Return points (f, 3), each transformed by its own pose (f, 4, 4)."""
+    """Return points (f, 3), each moved by its pose (f, 4, 4)."""
     return np.einsum("fij,fj->fi", poses[:, :3, :3], points) + poses[:, :3, 3]
 
 
@@ -423,7 +417,7 @@ class StraightParts:
         frame: index of the coordinate set, in flattened order, (p,).
         line: index of the muscle or ligament, (p,).
         bodies: indices of the bodies at the start and end of each part, (p, 2).
-        ends: start and end of each part in ground, m, (p, 2, 3).
+        ends: start and end in ground, m, (p, 2, 3).
     """
 
     frame: Index
@@ -449,7 +443,7 @@ class StraightParts:
 
 
 class Tension:
-    """Forces of strings of unit tension on path points and bodies, summed part by part.
+    """Forces of strings of unit tension on path points and bodies.
 
     `points` (f, k, 3), m, are in ground; `lines` and `bodies` (k,) are each point's muscle or
     ligament and body; `count` the numbers of both.
@@ -531,7 +525,7 @@ class Tension:
 
 
 def _direction(start: Array, end: Array) -> tuple[Array, Array]:
-    """Return unit vectors (f, 3) from start to end, zero if both coincide, and distances (f,)."""
+    """Return unit vectors (f, 3), zero if both coincide, and distances (f,)."""
     step = end - start
     distance = np.linalg.norm(step, axis=-1)
     return step / np.maximum(distance, 1e-300)[:, None], distance

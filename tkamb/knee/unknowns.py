@@ -36,20 +36,22 @@ MAX_CONDITION = 1e4
 
 @dataclass(frozen=True)
 class ContactPointSettings:
-    """Limits of lift-off, gap and sliding speed of the condyles."""
+    """Limits of lift-off, gap and sliding speed."""
 
     lift_off_angle: float = 0.5 * DEGREE
     """rad: a condyle is lifted off if the coronal angle from both gaps exceeds this angle, and the
     condyle's gap exceeds `lift_off_gap`. Source: error of fluoroscopy (Sharma 2008, 4.3)."""
     lift_off_gap: float = 0.5 * MILLIMETRE
-    """m: gap above which a condyle may be lifted off, see `lift_off_angle`. Source: error of
-    fluoroscopy (Sharma 2008, 4.3)."""
+    """m: gap above which a condyle may be lifted off, see `lift_off_angle`. Source as for
+    `lift_off_angle`.
+    """
     max_gap: float = 3e-3
     """m: a femoral component with a larger gap or penetration is misplaced. It is
     larger than the errors of fluoroscopy."""
     standstill_speed: float = 1e-3
-    """m/s: v0 of the regularised friction. Friction fades below this sliding speed.
-    It is far below the sliding speed of a moving knee."""
+    """m/s: v0 of the regularised friction. Friction fades below this sliding speed, which is far
+    below that of a moving knee.
+    """
 
 
 CONTACT_POINT = ContactPointSettings()
@@ -96,7 +98,7 @@ class Unknown:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Magnitudes of the unknown loads at one frame; NaN if the system is singular.
+    """Magnitudes of the unknowns; NaN if the system is singular.
 
     Args:
         values: name -> magnitude, N or N·m.
@@ -109,10 +111,9 @@ class Solution:
 
 
 def solve(names: Sequence[str], columns: Array, right: Array) -> Solution:
-    """Solve the equations of motion of one frame for the magnitudes of the unknown loads.
+    """Solve the equations of motion of one frame.
 
-    `columns` (k, k) are generalised forces per unit of each unknown; they must add up to `right`
-    (k,).
+    `columns` (k, k), generalised forces per unit of each unknown, must add up to `right` (k,).
 
     Raises:
         ValueError: the system is not square.
@@ -152,7 +153,7 @@ def moment_pair(link: str, other: str, moment: Array) -> tuple[PointForces, ...]
 
 
 def muscle_load(name: str) -> str:
-    """Return the name of a muscle's tension among the unknown loads."""
+    """Return the name of a muscle's tension."""
     return MUSCLE + name
 
 
@@ -171,9 +172,9 @@ def hip(point: Array) -> list[Unknown]:
 
 
 def intersegmental(point: Array, rotation_axes: dict[str, Array]) -> list[Unknown]:
-    """Return the knee's force and moment on the femur, for a knee without contact.
+    """Return the knee's force and moment on the femur without contact.
 
-    `point` (3,), m, is the knee centre; `rotation_axes` (3,) are unit axes of moments by name.
+    `point` (3,), m, is the knee centre; `rotation_axes` are unit axes (3,) of moments.
     """
     forces = [
         Unknown(f"knee_force_{name}", pair("femur", "tibia", point, axis))
@@ -200,10 +201,10 @@ def patellofemoral(point: Array, normal: Array, femur_ml: Array) -> list[Unknown
 
 
 def unloaded_patella(point: Array, femur_ml: Array) -> list[Unknown]:
-    """Return the loads that balance the patella's weight if no other loads do.
+    """Return the loads that balance the patella's weight, if it is released (massless) or its
+    extensor mechanism slack.
 
-    They replace a slack extensor mechanism, or belong to a released, massless patella. `point`
-    (3,), m, is the contact point on the femur.
+    `point` (3,), m, is the contact point on the femur.
     """
     # Any two directions in the sagittal plane can be used.
     first = cross(femur_ml, AXES["ap"])
@@ -216,13 +217,13 @@ def unloaded_patella(point: Array, femur_ml: Array) -> list[Unknown]:
 
 
 def condyle(side: str, contact: CondylePoint, friction: float) -> Unknown:
-    """Return the contact force of one condyle; its magnitude is the normal force."""
+    """Return a condyle's contact force, whose magnitude is the normal force."""
     force = contact.direction(friction)
     return Unknown(f"{side}_normal", pair("femur", "tibia", contact.point, force))
 
 
 def residuals(point: Array, lifted: bool, extensor: bool) -> list[Unknown]:
-    """Return the residuals, loads on the tibia that are zero in an exact model.
+    """Return the loads on the tibia that are zero in an exact model.
 
     Args:
         point: midpoint of the contact points, where the residual forces act, (3,), m.
@@ -255,8 +256,8 @@ class LoadState(NamedTuple):
     """The loads that are assumed to be zero.
 
     Args:
-        lifted: sides of the condyles that carry no load.
-        slack: names of the muscles of a slack extensor mechanism; empty: the mechanism is taut.
+        lifted: condyles without load.
+        slack: muscles of a slack extensor mechanism; empty: it is taut.
     """
 
     lifted: frozenset[str]
@@ -273,11 +274,11 @@ class LoadState(NamedTuple):
 def load_states(
     sides: Iterable[str], lifted_by_gap: frozenset[str], extensors: Iterable[str]
 ) -> list[LoadState]:
-    """Return the load states to try, the preferred states first.
+    """Return the load states to try, those with fewer zero loads first.
 
-    States with fewer zero loads come first. A slack muscle comes before a lifted condyle, because
-    the recorded gap shows contact, but no recording shows the activity of the muscle. `sides` are
-    the modelled condyles, `extensors` muscles; `lifted_by_gap`: by the recorded gap.
+    A slack muscle comes before a lifted condyle, because the recorded gap shows contact, but no
+    recording shows the muscle's activity. `sides` are the modelled condyles, `extensors` muscles;
+    `lifted_by_gap`: by the recorded gap.
     """
     not_lifted = [side for side in sides if side not in lifted_by_gap]
     lifted = [
@@ -296,7 +297,7 @@ def _muscles(values: Mapping[str, float]) -> list[str]:
 
 
 def wrong_signs(state: LoadState, solution: Solution) -> list[str]:
-    """Return descriptions of the loads with a wrong sign; empty: all signs are right."""
+    """Return descriptions of the loads with a wrong sign."""
     if not solution.regular:
         return ["singular equations"]
     values = solution.values
@@ -317,7 +318,7 @@ def wrong_signs(state: LoadState, solution: Solution) -> list[str]:
 def contradictions(
     state: LoadState, solutions: Mapping[LoadState, Solution], lifted_by_gap: frozenset[str]
 ) -> list[str]:
-    """Return reasons why a load state is inadmissible; empty: it is admissible.
+    """Return why a load state is inadmissible; empty: it is admissible.
 
     It is a load of the wrong sign, or a zero load that would act with the right sign. `solutions`
     has those of all states.

@@ -11,12 +11,12 @@ force is therefore d(t) G(t), with the total force F(t) in body weights and
 
 over the frames t of a trial of an activity.
 
-m is common to all trials of an activity, b to all frames of a trial. w is correlated over about
-0.1 s. S² is the mean square of the trials' biases, V the mean square of their scatters, over the
-trials of the activity or, if it has none, over all trials. All trials are of one subject. To
-include the differences between subjects, a published blind prediction of other subjects counts as
-one more trial. Its root mean square error in body weights is divided by G of walking. The square,
-bias² + scatter², is split into S² and V in the ratio of the trials.
+m is common to all trials of an activity, b to all frames of a trial. w is correlated over about 0.1
+s. S² is the mean square of the trials' biases, V the mean square of their scatters, over the trials
+of the activity or, if it has none, over all trials. All trials are of one subject; to include the
+differences between subjects, a published blind prediction of others counts as one more trial. Its
+root mean square error in body weights is divided by G of walking. The square, bias² + scatter², is
+split into S² and V in the ratio of the trials.
 
 With n trials of the activity and their mean bias B, m has the mean n B/(n + 1) and the variance
 S²/2/(n + 1). Then d has the variance
@@ -30,8 +30,8 @@ published errors. By Welch and Satterthwaite,
 
     ν = (T + Σ (A_i + V_i))² / (T²/n_T + Σ (A_i² + V_i²/ν_i)).
 
-Biases and scatters include the errors of the inputs. The variance due to the inputs is therefore
-subtracted from the variance of d.
+Biases and scatters include the errors of the inputs, whose variance is therefore subtracted from
+that of d.
 
 References: Kennedy & O'Hagan, J R Stat Soc B 63:425 (2001), doi:10.1111/1467-9868.00294;
 Satterthwaite, Biometrics Bull 2:110 (1946), doi:10.2307/3002019; independent frames of an AR(1):
@@ -82,20 +82,19 @@ FEWEST_FRAMES = 5
 PUBLISHED = {"total": (0.43, 1), "medial": (0.41, 4), "lateral": (0.43, 4)}
 """Force -> published root mean square error in walking (BW), and the number of published errors.
 
-Total: a blind prediction, 281 N (parametric model, third Grand Challenge, PMC3627216), divided by
-JW's weight. Medial and lateral: the middle of 229 to 312 N and of 238 to 326 N by the four winners
-of the Grand Challenges (Kinney et al. 2013, doi:10.1115/1.4023255).
+Total: a blind prediction, 281 N (parametric model, third Grand Challenge, PMC3627216), by JW's
+weight. Medial and lateral: the middle of 229 to 312 N and of 238 to 326 N by the four winners of
+the Grand Challenges (Kinney et al. 2013, doi:10.1115/1.4023255).
 """
 
 
 @dataclass(frozen=True)
 class TrialError:
-    """Error of one predicted force in one trial.
-
-    The error is measured minus predicted force, as a share of the load G.
+    """Error of one predicted force in one trial: measured minus predicted, as a share of the load
+    G.
 
     Args:
-        activity: name of the activity, as in [output] activity.
+        activity: as in [output] activity.
         inputs: root mean square over the frames of the standard deviation due to the inputs, as a
             share of G.
         correlation_s: time in which the autocorrelation of the error falls to 1/e, s.
@@ -136,7 +135,6 @@ def load_of(total: Array, body_weight: float) -> Array:
 
     Args:
         total: total force of each sample, (n, f); NaN in failed frames.
-        body_weight: body weight in the same unit.
     """
     load = np.full(total.shape[1], np.nan)
     finite = np.isfinite(total).any(axis=0)
@@ -156,8 +154,8 @@ def trial_error(
 
     Args:
         time: times, s, (f,).
-        samples: force of each sample with varied inputs, N, (n, f); NaN in failed frames.
-        measured: measured force, N, (f,); NaN in frames without a measurement.
+        samples: force with varied inputs, N, (n, f); NaN in failed frames.
+        measured: force, N, (f,); NaN without a measurement.
         nominal: force of the nominal run, N, (f,).
         load: load G from `load_of`, N, (f,).
     """
@@ -180,14 +178,14 @@ def trial_error(
 
 
 def _frame_correlation(scatter: Array) -> float:
-    """Return the correlation of successive frames in an AR(1) process, above 0 and below 1."""
+    """Return the correlation of successive frames (AR(1)), in (0, 1)."""
     product = float(scatter[1:] @ scatter[:-1])
     rho = product / max(float(scatter[1:] @ scatter[1:]), np.finfo(float).tiny)
     return float(np.clip(rho, 1e-3, 1.0 - 1e-3))
 
 
 def fitted(errors: Sequence[TrialError], force: str, activity: str | None) -> Discrepancy | None:
-    """Return the discrepancy of a force in an activity; None: no trial has an error of this force.
+    """Return the discrepancy of a force in an activity; None: no trial has its error.
 
     Args:
         errors: errors of all compared trials.
@@ -225,12 +223,11 @@ def band_with_discrepancy(
 ) -> Array:
     """Return the band of inputs and discrepancy together, (percents, f), in the samples' unit.
 
-    The band belongs to the sum of two independent variables: the force of the samples, and the
-    discrepancy. Contacts only push, so the band is that of the sums above zero. It is asymmetric
-    where the force is small.
+    It is that of the sum of two independent variables, sampled force and discrepancy, above zero:
+    contacts only push. It is asymmetric where the force is small.
 
     Args:
-        samples: force of each sample, (n, f); NaN in failed frames.
+        samples: force, (n, f); NaN in failed frames.
         load: load G from `load_of` in the samples' unit, (f,).
     """
     added = stdtrit(discrepancy.freedom, _middles(QUANTILES))
@@ -261,7 +258,7 @@ def _middles(count: int) -> Array:
 
 
 def coverage(low: Array, high: Array, measured: Array) -> tuple[int, float]:
-    """Return the number of frames with band and measured force, and the share inside the band."""
+    """Return the frames with band and measured force, and the share inside the band."""
     compared = np.isfinite(low) & np.isfinite(high) & np.isfinite(measured)
     inside = (low <= measured) & (measured <= high)
     share = float(inside[compared].mean()) if compared.any() else float("nan")
@@ -270,7 +267,7 @@ def coverage(low: Array, high: Array, measured: Array) -> tuple[int, float]:
 
 @lru_cache(maxsize=1)
 def known_errors() -> tuple[TrialError, ...]:
-    """Return the errors of all compared trials from the package's data."""
+    """Return the errors of all compared trials, which the package stores."""
     return tuple(TrialError(**row) for row in json.loads(DATA.read_text(encoding="utf-8")))
 
 
@@ -284,9 +281,8 @@ def write_errors(errors: Sequence[TrialError], path: Path = DATA) -> None:
 
 
 def discrepancy_of(summary: Mapping[str, Any]) -> dict[str, Discrepancy]:
-    """Return force -> discrepancy of a run in its activity; empty without [muscles].
-
-    All compared runs had [muscles].
+    """Return force -> discrepancy of a run in its activity; empty without [muscles], which all
+    compared runs had.
     """
     if "muscles" not in (summary.get("scene_tables") or {}):
         return {}

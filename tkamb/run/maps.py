@@ -2,13 +2,13 @@
 
 The file is written a few frames at a time: first their maps, then their times. The length of
 `/time_s` is therefore the number of complete frames, even if the run was killed. Each frame is a
-compressed chunk of its own, so that a write does not alter earlier frames. Readers inside tkamb
-take a few frames at a time (`ContactMaps.rows`, `ContactMaps.blocks`), so that their memory does
-not depend on the length of the recording.
+compressed chunk of its own, so that a write does not alter earlier frames. Readers take a few
+frames at a time (`ContactMaps.rows`, `ContactMaps.blocks`), so that memory does not depend on the
+length of the recording.
 
 The HDF5 library cannot close a file after a failed write: it tries again, fails, and ends the
-process. tkamb lets the library write through a Python file object. This object records the first
-failure and ignores later writes. The library can then close the file, and `new_hdf5` raises.
+process. tkamb's writes go through a Python file object, which records the first failure and ignores
+later writes, so that the library can close the file and `new_hdf5` raises.
 """
 
 import io
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 class NotingFile(io.FileIO):
-    """A file object for HDF5 that records the first failed write and raises no error.
+    """A file object for HDF5 that records a failed write and raises no error.
 
     Args:
         path: the file. A file or link of this name is removed first, so that nothing is written
@@ -42,9 +42,6 @@ class NotingFile(io.FileIO):
 
     Attributes:
         failure: error of the first failed write; None if every write has succeeded.
-
-    Raises:
-        OSError: the file cannot be opened.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -84,7 +81,7 @@ class NotingFile(io.FileIO):
 
 @contextmanager
 def new_hdf5(path: Path) -> Iterator[Any]:
-    """Provide a new HDF5 file, open for writing.
+    """Provide a new HDF5 file.
 
     Args:
         path: path of a temporary file; after a failure its content is incomplete.
@@ -115,7 +112,7 @@ PER_FRAME = (
 BLOCK_BYTES = 16e6
 """bytes: size of the maps that are read at a time. Smaller blocks cost more calls of HDF5."""
 SHARE_OF_MEMORY = 0.25
-"""1: largest size of a whole array as a share of the available memory. Not studied."""
+"""1: largest whole array, as a share of the available memory. Not studied."""
 
 
 # bytes: size of the maps that are collected for one write. A write takes as long as
@@ -124,7 +121,7 @@ BUFFER_BYTES = 4e6
 
 
 class MapWriter:
-    """Writes contact.h5 frame by frame. Flushed frames remain readable if the process is killed.
+    """Writes contact.h5; flushed frames remain readable if the process is killed.
 
     Args:
         path: path of the file, which is replaced if it exists; None: the file is in memory only.
@@ -201,7 +198,7 @@ class MapWriter:
             pressure: pressure at the map points, Pa, (n,).
             gap: gap at the map points, m, (n,).
             nodal_force: forces on the insert, N, (n, 3).
-            femoral_pose: pose_femoral_in_insert of the map, (4, 4).
+            femoral_pose: pose_femoral_in_insert, (4, 4).
             contact_points: contact points of medial condyle, lateral condyle and patella in the
                 insert frame, m, (3, 3); NaN: unknown.
             contact_normals: unit normals at these points, out of the insert or into the patella,
@@ -255,7 +252,7 @@ class MapWriter:
         return ContactMaps(arrays, dict(self._file.attrs))
 
     def close(self) -> None:
-        """Write the appended frames and close the file.
+        """Write the remaining frames and close the file.
 
         Raises:
             InputError: the file cannot be written.
@@ -273,7 +270,7 @@ class MapWriter:
 
     @contextmanager
     def _written(self) -> Iterator[None]:
-        """Raise an InputError for an error of HDF5, such as on a full disk."""
+        """Raise an InputError for an error of HDF5, as on a full disk."""
         try:
             yield
             if self._stream is not None:
@@ -440,7 +437,7 @@ class ContactMaps:
         return np.concatenate([np.zeros((0, 3)), *forces])
 
     def _optional_array(self, name: str) -> Array:
-        """Return an array (f, 3, 3), or NaN if an early file lacks it."""
+        """Return (f, 3, 3), NaN if an early file lacks it."""
         missing = np.full((len(self.time_s), 3, 3), np.nan)
         if not isinstance(self.source, Path):
             return np.asarray(self.source.get(name, missing), float)
@@ -493,14 +490,14 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 FILTERS = frozenset({h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE})
-"""Compression filters that tkamb uses. Any other filter could load a library."""
+"""Compression filters that tkamb uses; any other could load a library."""
 
 
 def check_maps_file(file: Any) -> None:
     """Raise unless an open HDF5 file itself contains the arrays that tkamb writes.
 
-    An HDF5 file can refer to arrays in other files (external storage, external links, virtual
-    datasets). A results folder from someone else could thereby make tkamb read private files.
+    HDF5 can refer to arrays in other files (external storage, external links, virtual datasets), so
+    that someone else's results folder could make tkamb read private files.
 
     Raises:
         ValueError: an array is missing, stored in another file, or has another length.

@@ -21,8 +21,7 @@ Elliptic integrals give the part of a half-space (L = 1), quadrature gives the p
 
 Reference: Johnson, Contact Mechanics (1985), sections 3.4 and 5.8.
 
-The formulas are independent of the models' code. F is the load, d the approach, E Young's modulus
-and nu Poisson's ratio.
+F is the load, d the approach, E Young's modulus and nu Poisson's ratio.
 
 - plate: a rigid flat plate on a block of height h and area A with nu = 0. The stress is F/A
   everywhere. The approach is d = h eps(F/A), with the material's curve eps(sigma) = sigma/E +
@@ -85,9 +84,8 @@ class LayerContact:
 
     Args:
         contact_radius: radius of the contact area, m.
-        approach: approach, m.
-        radii: mean radii of the pressure rings, m, shape (n,).
-        pressure: pressure of the rings, Pa, shape (n,).
+        radii: mean radii of the pressure rings, m, (n,).
+        pressure: pressure of the rings, Pa, (n,).
     """
 
     contact_radius: float
@@ -99,15 +97,7 @@ class LayerContact:
 def sphere_on_layer(
     radius: float, thickness: float, load: float, young_modulus: float, poisson_ratio: float
 ) -> LayerContact:
-    """Return the contact of a sphere (a paraboloid) under a load.
-
-    Args:
-        radius: radius of the sphere, m.
-        thickness: thickness of the layer, m.
-        load: load, N.
-        young_modulus: Young's modulus of the layer, Pa.
-        poisson_ratio: Poisson's ratio of the layer.
-    """
+    """Return the contact of a sphere (a paraboloid) on a layer, in SI units."""
     low, high = 1e-6, 0.5 * thickness + 0.2 * radius
     for _ in range(60):
         middle = 0.5 * (low + high)
@@ -171,12 +161,12 @@ WIDTH_EFFECT = 0.005
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """The reference solution of a case.
+    """Solution of a case.
 
     Args:
         values: approach, m, and forces, N, pressures, Pa, and areas, m², of the condyles.
         uncertainty: uncertainty of each value, in the same unit.
-        grids_mm: cell sizes of the solved grids, mm.
+        grids_mm: cell sizes, mm.
         solved: grid, as "fe 1 mm" -> its values.
         map: "i j" -> pressure, Pa, of the finest finite-element grid on a raster of 1 mm.
     """
@@ -195,7 +185,7 @@ class Reference:
 
 
 def compute_reference(case: StudyCase, grids_mm: tuple[float, ...] | None = None) -> Reference:
-    """Solve a case on grids of the given or default cell sizes, mm, and return its reference.
+    """Solve a case on grids of the given or default cell sizes, mm.
 
     Raises:
         ComputationError: a grid did not converge.
@@ -222,7 +212,7 @@ def compute_reference(case: StudyCase, grids_mm: tuple[float, ...] | None = None
 
 
 def limits(solved: dict[str, Quantities]) -> tuple[Quantities, Quantities]:
-    """Return values and uncertainties (see the module) from "fe 1 mm" -> values of that grid."""
+    """Return values and uncertainties (see the module) from "fe 1 mm" -> its values."""
     h = np.array([float(name.split()[1]) for name in solved]) * MILLIMETRE
     family = np.array([FAMILIES.index(name.split()[0]) for name in solved])
     values, uncertainty = {}, {}
@@ -240,16 +230,16 @@ def limits(solved: dict[str, Quantities]) -> tuple[Quantities, Quantities]:
 
 
 def common_limit(h: Array, values: Array, family: Array) -> tuple[float, float]:
-    """Return the common limit h -> 0 of several families of grids, and its uncertainty.
+    """Return the common limit h -> 0 of several families f of grids, and its uncertainty.
 
-    The limit q0 is from a least-squares fit of q0 + c_f h² over all families f (Richardson
-    extrapolation of trilinear cells). The uncertainty is the larger of the largest residual and
-    half the range of the families' separate limits.
+    The limit q0 is of a least-squares fit q0 + c_f h² (Richardson extrapolation of trilinear
+    cells). The uncertainty is the larger of the largest residual and half the range of the
+    families' separate limits.
 
     Args:
-        h: cell sizes, m, shape (n,).
-        values: results on the grids, shape (n,).
-        family: number of the family of each grid, shape (n,).
+        h: cell sizes, m, (n,).
+        values: results, (n,).
+        family: number of the family of each grid, (n,).
     """
     kinds = np.unique(family)
     slopes = np.where(family[:, None] == kinds, h[:, None] ** 2, 0.0)
@@ -265,7 +255,7 @@ def common_limit(h: Array, values: Array, family: Array) -> tuple[float, float]:
 
 
 def _by_layer(case: StudyCase, sphere: Sphere) -> tuple[Quantities, Quantities]:
-    """Return the exact solution of the layer. The uncertainty is the effect of a finite width."""
+    """Return the exact solution; its uncertainty is the effect of a finite width."""
     layer = sphere_on_layer(
         sphere.radius,
         sphere.thickness,
@@ -339,8 +329,9 @@ TOLERANCES: dict[str, tuple[float, float]] = {
     "bed": (0.01, 0.06),
     "hertz": (0.01, 0.01),
 }
-"""Largest relative errors of approach and pressure. For plates they are a few times the solver's
-tolerance, otherwise 1.5 times the measured discretisation error."""
+"""Largest relative errors of approach and pressure. For plates a few times the solver's tolerance,
+otherwise 1.5 times the measured discretisation error.
+"""
 
 
 @dataclass(frozen=True)
@@ -370,7 +361,7 @@ class ClosedForm:
 
     @property
     def label(self) -> str:
-        """Description with the values that differ from the default, as "plate: load_N=1"."""
+        """The values that differ from the default, as "plate: load_N=1"."""
         base = vars(ClosedForm(self.kind, self.model))
         changed = [f"{k}={v}" for k, v in vars(self).items() if v != base[k]]
         return f"closed form, {self.kind}: {', '.join(changed) or 'as it is'}"
@@ -403,7 +394,7 @@ class ClosedForm:
 
 
 def press_closed_form(case: ClosedForm) -> tuple[ContactResult, ContactPair]:
-    """Press a case. A "kept" case first stores the operator of another modulus in its cache.
+    """Press a case; a "kept" case first stores the operator of another modulus in its cache.
 
     Raises:
         ComputationError: the cache does not contain one operator for each modulus.
@@ -491,7 +482,7 @@ def closed_forms(quick: bool) -> Iterator[ClosedForm]:
 def _wide(
     kind: str, model: str, load_N: float = 3000.0, nu: float = 0.3, **options: bool
 ) -> ClosedForm:
-    """Return a case of a sphere of 300 mm on 12 mm. The contact spans several cells of 3 mm."""
+    """Return a sphere of 300 mm on 12 mm: the contact spans several cells of 3 mm."""
     return ClosedForm(kind, model, load_N, 12.0, nu=nu, radius_mm=300.0, **options)
 
 
@@ -525,7 +516,7 @@ def _strain(case: ClosedForm, stress: float) -> float:
 
 
 def _column(case: ClosedForm) -> Callable[[float], float]:
-    """Return the pressure, Pa, of a column of the bed as a function of its strain e = d/h.
+    """Return the pressure, Pa, of a column of the bed at a strain e = d/h.
 
     Linear: M e with M = E (1 - nu)/((1 + nu)(1 - 2 nu)). Otherwise: the stress at which the
     Ramberg-Osgood strain is -(M/E) ln(1 - e).
@@ -544,7 +535,7 @@ def _column(case: ClosedForm) -> Callable[[float], float]:
 
 
 def _inner(result: ContactResult) -> Mask:
-    """Return which map points lie at least a fifth of the block's side from its edges."""
+    """Return which map points lie a fifth of the block's side from its edges."""
     across = np.abs(result.points[:, [0, 2]]).max(axis=1)
     inner: Mask = across < 0.3 * BLOCK_SIDE_MM * MILLIMETRE
     return inner

@@ -13,9 +13,9 @@ A uniform strain then stores the energy of an isotropic solid with lambda = mu
 
     K_d = V B̄ᵀ (2 I_dev) B̄ + Pᵀ K_spr P
 
-B̄ gives the strain of the cell's mean displacement gradient, and I_dev its deviatoric part. P
-subtracts the linear field of this gradient from the displacement. K_spr is the matrix of the
-springs. So the patch test is exact for sheared cells too.
+Here B̄ gives the strain of the cell's mean displacement gradient and I_dev its deviatoric part, P
+subtracts the linear field of this gradient, and K_spr is the matrix of the springs. So the patch
+test is exact for sheared cells too.
 """
 
 from collections.abc import Iterator
@@ -45,16 +45,16 @@ def deviatoric_matrices(
 ) -> Array:
     """Return K_d = V B̄ᵀ (2 I_dev) B̄ + Pᵀ K_spr P of cells (c, 24, 24), m per unit shear modulus.
 
-    Between nodes i and j the first part is V (g_i·g_j I + g_j g_iᵀ - 2/3 g_i g_jᵀ). A spring
-    k along n between corners a and b adds k r_i r_j n nᵀ. Here r is the difference of the rows b
-    and a of P = I - x gᵀ (8, 8).
+    Between nodes i and j the first part is V (g_i·g_j I + g_j g_iᵀ - 2/3 g_i g_jᵀ). A spring k
+    along n between corners a and b adds k r_i r_j n nᵀ. Here r is the difference of the rows b and
+    a of P = I - x gᵀ (8, 8).
 
     Args:
-        corners: true corners, m, shape (c, 8, 3).
-        gradients: mean gradients g, 1/m, shape (c, 8, 3).
-        volumes: m³, shape (c,).
-        springs: `spring_families` of the nominal box, m, shape (28,).
-        pairs: corners that each spring joins, shape (28, 2).
+        corners: true corners, m, (c, 8, 3).
+        gradients: mean gradients g, 1/m, (c, 8, 3).
+        volumes: m³, (c,).
+        springs: `spring_families` of the nominal box, m, (28,).
+        pairs: corners that each spring joins, (28, 2).
     """
     result = np.zeros((len(corners), 24, 24))
     excess = np.empty((8, 8))
@@ -118,7 +118,6 @@ def hourglass_shapes(
 
 @compiled
 def _along(a: Array, b: Array) -> float:
-    """Return the scalar product of two vectors of eight numbers."""
     total = 0.0
     for i in range(8):
         total += a[i] * b[i]
@@ -139,20 +138,20 @@ def _shear_force(
 ) -> tuple[float, float]:
     """Write K_d u of a cell into `force`; return uᵀ K_d u, m³, and the mean dilatation g · u.
 
-    The matrix K_d is not assembled. With G = sum u_i g_iᵀ, D = 2 V dev(sym G) and q = S gamma u,
-    the nodal forces are D g_i + gamma_iᵀ q. The eight values of an axis are adjacent in memory, so
-    that they fill the processor's vector registers. G and D are in nine and six registers.
+    With G = sum u_i g_iᵀ, D = 2 V dev(sym G) and q = S gamma u, the nodal forces are D g_i +
+    gamma_iᵀ q. The eight values of an axis are adjacent in memory, so that they fill the
+    processor's vector registers. G and D are in nine and six registers.
 
     Args:
-        g: mean gradients, 1/m, shape (3, 8).
-        gamma: see `hourglass_shapes`, shape (4, 8).
-        stiffness: S, m, shape (12, 12).
+        g: mean gradients, 1/m, (3, 8).
+        gamma: see `hourglass_shapes`, (4, 8).
+        stiffness: S, m, (12, 12).
         volume: m³.
-        nodes: the cell's nodes, shape (8,).
-        displacement: m, shape (n, 3).
+        nodes: the cell's nodes, (8,).
+        displacement: m, (n, 3).
         u: scratch (3, 8) for displacements relative to the first node, m.
         b: scratch (2, 12) for gamma u, m, and q, m².
-        force: K_d u, m², shape (3, 8).
+        force: K_d u, m², (3, 8).
     """
     first = nodes[0]
     for i in range(8):
@@ -203,13 +202,13 @@ def shear_forces(
     """Return K_d u (k, 24) and the equivalent strain (k,), e² = uᵀ K_d u / (3 V), of cells.
 
     Args:
-        gradients: mean gradients, 1/m, shape (c, 3, 8).
-        gammas: see `hourglass_shapes`, shape (c, 4, 8).
-        stiffness: S, m, shape (c, 12, 12).
-        volumes: m³, shape (c,).
-        nodes: the cells' nodes, shape (c, 8).
-        chosen: numbers of the cells, shape (k,).
-        displacement: m, shape (n, 3).
+        gradients: mean gradients, 1/m, (c, 3, 8).
+        gammas: see `hourglass_shapes`, (c, 4, 8).
+        stiffness: S, m, (c, 12, 12).
+        volumes: m³, (c,).
+        nodes: the cells' nodes, (c, 8).
+        chosen: numbers of the cells, (k,).
+        displacement: m, (n, 3).
     """
     forces, strains = np.empty((len(chosen), 24)), np.empty(len(chosen))
     u, b, force = np.empty((3, 8)), np.empty((2, 12)), np.empty((3, 8))
@@ -485,6 +484,6 @@ class CalibratedNetwork(Solid):
         return gradients, *hourglass_shapes(*measures), self.volume
 
     def _state(self, displacement: Array, chosen: Index | None = None) -> tuple[Array, Array]:
-        """Return K_d u (k, 24) and the equivalent strain e (k,) of the chosen cells."""
+        """Return K_d u (k, 24) and the equivalent strain e (k,)."""
         cells = np.arange(len(self.cells)) if chosen is None else chosen
         return shear_forces(*self._shapes, self.cells, cells, displacement)

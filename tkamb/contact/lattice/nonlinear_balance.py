@@ -12,9 +12,9 @@ doi:10.1137/10078356X). The softening s is the ratio of secant and tangent stiff
 that K/s approximates the tangent stiffness.
 
 An element's share of h grows with a power of its strain (4.5 for polyethylene). So passes evaluate
-only the `Region` of the elements with the largest shares. The shares of the other elements and the
-rounding error of the factor change little from pass to pass. They are measured with the whole solid
-(`NonlinearBalance.measure`), and are constant until the next measurement.
+only the `Region` of the largest shares. The other shares and the rounding error of the factor
+change little: they are measured with the whole solid (`NonlinearBalance.measure`), and constant
+until the next measurement.
 """
 
 from dataclasses import dataclass, replace
@@ -30,7 +30,7 @@ from tkamb.geometry.frames import Array, Index, Mask
 
 @dataclass(frozen=True)
 class Residual:
-    """The measured residuals of a state, which stop the iteration.
+    """The measured residuals, which stop the iteration.
 
     Args:
         force: |r| over the free unknowns, relative to |f|, with r = f - f_int(u).
@@ -57,14 +57,14 @@ class Residual:
         candidates: Index,
         softening: float,
     ) -> "Residual":
-        """Return the force, the work and the peak of residual nodal forces.
+        """Return force, work and peak of residual nodal forces.
 
         Args:
-            r: f - f_int(u), N, shape (n, 3), zero at held unknowns.
-            field: u, m, shape (n, 3).
-            force: contact forces on the candidates, N, shape (m, 3).
-            displacement: displacement of the candidates, m, shape (m, 3).
-            candidates: their nodes, shape (m,).
+            r: N, (n, 3), zero at held unknowns.
+            field: u, m, (n, 3).
+            force: contact forces on the candidates, N, (m, 3).
+            displacement: displacement of the candidates, m, (m, 3).
+            candidates: their nodes, (m,).
             softening: s.
         """
         size = max(float(np.linalg.norm(force)), 1e-300)
@@ -86,11 +86,11 @@ class Residual:
 
 
 class LinearBalance:
-    """The balance of a linear material. It needs no loads h; passes repeat rays and contact.
+    """The balance of a linear material. It needs no loads h: passes repeat rays and contact.
 
     Attributes:
-        offset: displacement of the candidates without contact forces, m, shape (m, 3).
-        displacement: total displacement of the candidates, m, shape (m, 3).
+        offset: displacement of the candidates without contact forces, m, (m, 3).
+        displacement: total displacement of the candidates, m, (m, 3).
     """
 
     residual, field, h, half, region, softening = Residual(0.0), None, None, None, None, 1.0
@@ -113,17 +113,16 @@ class NonlinearBalance:
     """The iteration for the nonlinear loads h of one solution.
 
     Args:
-        problem: solid and operator.
         guess: response of the candidates; h, region and softening of an earlier solution.
 
     Attributes:
-        displacement: displacement of the candidates, m, shape (m, 3), from the compliance; after
+        displacement: displacement of the candidates, m, (m, 3), from the compliance; after
             `measure` from the factor.
-        field: displacement of the region's nodes, after `measure` of all nodes, m, shape (n, 3).
+        field: displacement of the region's nodes, after `measure` of all nodes, m, (n, 3).
         residual: force and work of the region, after `measure` of the whole solid.
-        h: nonlinear loads of the last pass, N, shape (n, 3).
+        h: nonlinear loads of the last pass, N, (n, 3).
         half: L⁻¹ h in elimination order.
-        loads: h + r, N, shape (n, 3).
+        loads: h + r, N, (n, 3).
         softening: s of the last measurement.
     """
 
@@ -143,7 +142,6 @@ class NonlinearBalance:
             self.h, self.half = guess.loads, guess.half
 
     def _set_loads(self, h: Array) -> None:
-        """Set h (n, 3), N, on the nodes of the region, and 0 elsewhere."""
         self.h, nodes = np.zeros_like(h), self._region.nodes
         self.h[nodes] = h[nodes]
         self.half = self._problem.operator.start(self.h, self._region.fronts)
@@ -154,11 +152,11 @@ class NonlinearBalance:
         return self._response.displacement(self.half) + self._rounding
 
     def displace(self, force: Array, displacement: Array) -> None:
-        """Compute the region's displacement and residual under contact forces.
+        """Compute the region's displacement and residual.
 
         Args:
-            force: forces on the candidates, N, shape (m, 3).
-            displacement: candidates' displacement from the condensed compliance, m, shape (m, 3).
+            force: forces on the candidates, N, (m, 3).
+            displacement: candidates' displacement from the condensed compliance, m, (m, 3).
         """
         operator, region, solid = self._problem.operator, self._region, self._problem.solid
         self._force, self.displacement = force, displacement
@@ -179,7 +177,7 @@ class NonlinearBalance:
         self._set_residual(r)
 
     def measure(self) -> None:
-        """Measure displacement and residual of the whole solid, with the law of every element."""
+        """Measure displacement and residual of the whole solid."""
         if self._measured:
             return
         solid, operator = self._problem.solid, self._problem.operator
@@ -201,7 +199,6 @@ class NonlinearBalance:
         self.displacement = measured
 
     def _set_residual(self, r: Array) -> None:
-        """Set the residual from the residual nodal forces (n, 3), N."""
         for loads in (r, self.loads):
             loads.ravel()[self._problem.held_unknowns] = 0.0
         last, self._size = self.residual, float(np.linalg.norm(self._force))
@@ -227,7 +224,7 @@ class NonlinearBalance:
         self._set_loads(next_loads)
 
     def _choose_region(self) -> None:
-        """Choose the region; the loads of the other elements are constant from here on."""
+        """Choose the region; the other elements' loads are constant from here on."""
         tolerance = self._settings.force_tolerance * self._size
         if self._region.whole or self._beyond(self._region, self.loads - self.h) > tolerance:
             region = self.region
@@ -251,7 +248,7 @@ class NonlinearBalance:
         return Region.of(self._problem, np.flatnonzero(largest_shares(self._sizes, allowed)))
 
     def _beyond(self, region: Region, force: Array) -> float:
-        """Return the norm of forces (n, 3), N, on the nodes outside of a region."""
+        """Return the norm of forces (n, 3), N, outside of a region."""
         outside = force.copy()
         outside[region.nodes] = 0.0
         return float(np.linalg.norm(outside))
@@ -267,10 +264,10 @@ def forces_of(solid: Solid, field: Array) -> tuple[Array, Array, float]:
 def accelerated(iterates: list[tuple[Array, Array]]) -> Array:
     """Return the next x of a fixed-point iteration x = g(x), by Anderson's method.
 
-    The method combines the iterates so that the linearised residual is smallest.
+    It combines the iterates so that the linearised residual is smallest.
 
     Args:
-        iterates: pairs of g(x) and g(x) - x, shape (n,) each, the newest last.
+        iterates: pairs of g(x) and g(x) - x, (n,) each, the newest last.
     """
     value, residual = iterates[-1]
     if len(iterates) == 1:
@@ -283,10 +280,10 @@ def accelerated(iterates: list[tuple[Array, Array]]) -> Array:
 
 
 def largest_shares(size: Array, allowed: float) -> Mask:
-    """Return the mask (c,) of the elements of the region: all but the smallest shares of h.
+    """Return the elements (c,) of the region: all but the smallest shares of h.
 
     Args:
-        size: norm of each element's share of h, N, shape (c,).
+        size: norm of each element's share of h, N, (c,).
         allowed: largest root of the sum of squares of the omitted shares, N.
     """
     result = size > allowed / np.sqrt(len(size))  # the others are within the bound in any case

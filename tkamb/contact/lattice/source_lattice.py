@@ -1,7 +1,7 @@
 """The lattice of Sharma (2008) and its own loops, for comparison (`lattice-source`).
 
-The loops follow Sharma (2008), section 4.5.5. Nodes in contact get the vertical displacement that
-brings them onto the femoral component, and slide freely in x and z. All other nodes have no load.
+Nodes in contact get the vertical displacement that brings them onto the femoral component, and
+slide freely in x and z (section 4.5.5). All other nodes have no load.
 
 Linear: a unit displacement of the nodes in contact gives the slope of the reaction F. One
 correction of the approach D then gives the load, if the contact set does not change. Nonlinear: at
@@ -52,12 +52,11 @@ class ConjugateGradientSettings:
     """When the linear system of a tangent step of Sharma's loops counts as solved."""
 
     tolerance: float = 0.02
-    """1: largest residual relative to the right-hand side. Smaller: more iterations for each
-    tangent step. Larger: more tangent steps. The next tangent step corrects the
-    error."""
+    """1: largest residual relative to the right-hand side. The next tangent step corrects the
+    error.
+    """
     max_iterations: int = 60
-    """Largest number of iterations for a tangent step; then the last iterate is used. Smaller: more
-    tangent steps. Larger: a step may take longer."""
+    """Largest number of iterations for a tangent step; then the last iterate is used."""
 
 
 CONJUGATE_GRADIENT = ConjugateGradientSettings()
@@ -146,7 +145,7 @@ class HeldNodes:
         return np.where(self.held, 0.0, values.ravel())
 
     def _solve_linear(self, force: Array) -> Array:
-        """Return P f (n, 3), m, of a force f (n, 3), N."""
+        """Return P f (n, 3), m."""
         y = self._operator.start(force)
         if len(self._chosen):
             projection = self._response.half.project(y)[self._chosen]
@@ -156,7 +155,7 @@ class HeldNodes:
         return self._operator.nodal(y)
 
     def _push(self, force: Array, y: Array) -> None:
-        """Add Z f to y, for vertical forces f (a,), N, on the active nodes."""
+        """Add Z f to y, for vertical forces f (a,), N."""
         candidate_force = np.zeros(len(self._active))
         candidate_force[self._chosen] = force
         self._response.half.apply(candidate_force, y)
@@ -170,25 +169,25 @@ class LoopSettings:
     """
 
     max_loops: int = 60
-    """Largest number of changes of the contact set or of D. Smaller: more presses do not converge.
-    Larger: a press that cannot converge takes longer."""
+    """Largest number of changes of the contact set or of D."""
     max_steps: int = 30
-    """Largest number of tangent steps at one D. Smaller: faster loops, but perhaps more of them.
-    Larger: smaller residual at one D."""
+    """Largest number of tangent steps at one D."""
     first_depth: float = 0.8
     """1: first D, relative to the depth that the candidates cover. The candidates
     cover 1.25 times the expected approach, and 1 / 1.25 = 0.8."""
     load: float = 0.1
-    """1: largest relative error of the load, relative to the solver's `force_tolerance`. Smaller:
-    more loops. Larger: fewer loops, but the forces have the same relative error as the load."""
+    """1: largest relative error of the load, relative to the solver's `force_tolerance`. The forces
+    have the same relative error as the load.
+    """
     balance: float = 0.01
     """1: the tangent steps at one D end when the residual of the free nodes is below this share of
     the relative error of the load (or of the solver's `force_tolerance`, if that is larger).
-    Smaller: more tangent steps in each loop. Larger: fewer, but the reaction that corrects D is
-    less accurate."""
+    Larger: the reaction that corrects D is less accurate.
+    """
     smallest_step: float = 0.05
-    """1: smallest share of a tangent step. A step that raises the residual is halved until about
-    this share. Smaller: more halvings. Larger: more steps that raise the residual."""
+    """1: smallest share of a tangent step: one that raises the residual is halved until about this
+    share.
+    """
 
 
 LOOP = LoopSettings()
@@ -270,7 +269,7 @@ def solve_by_loops(
 ) -> Solution:
     """Return the result of `solver.solve` by Sharma's loops.
 
-    The problem's `direction` is "vertical". Of the guess, only candidates, planes and reach are
+    The problem's `direction` is "vertical"; of the guess, only candidates, planes and reach are
     used.
     """
     nodes = problem.contact_nodes[guess.candidates]
@@ -314,7 +313,7 @@ def solve_by_loops(
 def _next_depth(
     problem: ContactProblem, history: list[tuple[float, float]], load: float, slope: float
 ) -> float:
-    """Return D from the stiffness of the contact (linear) or the growth exponent m (nonlinear)."""
+    """Return D by stiffness (linear) or growth exponent m (nonlinear)."""
     depth, reaction = history[-1]
     if problem.solid.material.is_linear:
         return depth + (load - reaction) / slope
@@ -341,9 +340,9 @@ def _press(
     target: float,
     settings: LoopSettings,
 ) -> _Pressed:
-    """Return the equilibrium for the prescribed vertical displacement of the active nodes.
+    """Return the equilibrium for prescribed vertical displacements of the active nodes.
 
-    The first step is linear, as in Sharma (2008). Tangent steps follow, until the residual is below
+    Tangent steps follow a first linear step, as in Sharma (2008), until the residual is below
     `target` times the contact force. A step that raises it is halved.
     """
     solid = response.problem.solid

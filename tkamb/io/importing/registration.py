@@ -1,7 +1,7 @@
 """Marker positions on the segments of a leg, found together with the motion of several trials.
 
-A laboratory rarely knows where its markers sit on the bones. The motion tells: hip, knee and ankle
-are joints, so that a marker in the wrong place disagrees with the others in many frames. With the
+Where markers sit on the bones is rarely measured. The motion shows it: hip, knee and ankle are
+joints, so that a marker in the wrong place disagrees with the others in many frames. With the
 measured markers p, the pose q of the leg in each frame and the parameters θ (positions of the
 markers, shifts of hip and ankle in thigh and shank, mean offset of the knee from the model's),
 
@@ -41,12 +41,14 @@ class RegistrationSettings:
     max_frames: int = 320
     """Largest number of frames of all trials. Not studied; c makes more frames worthless."""
     independent: float = 8.0
-    """Number of independent observations in all frames: skin moves alike in each stride, and over
-    some eighth of it. Chosen such that the stated deviations contain the truth as often as they
-    should in synthetic walks (tests/test_registration.py)."""
+    """Number of independent observations in all frames (an eighth of a stride each). The stated
+    deviations then contain the truth as often as they should in synthetic walks
+    (tests/test_registration.py).
+    """
     marker: float = 15.0 * MILLIMETRE
-    """m: scale τ of a marker's distance from the model's position in each direction. Not studied:
-    hands place markers to about this accuracy."""
+    """m: scale τ of a marker's distance from the model's position, by direction. Not studied: hands
+    place markers to about this accuracy.
+    """
     marker_freedom: float = 4.0
     """Degrees of freedom of Student's t of that distance. Single markers lie much
     farther away: of subject DM one by 80 mm."""
@@ -73,9 +75,9 @@ class RegistrationSettings:
     a segment together. Shank and thigh as in `SKIN_MARKER_ERROR`; foot and pelvis are
     assumptions."""
     noise_rounds: int = 6
-    """Number of estimates of σ. The fourth changes it by less than 2 %."""
+    """Number of estimates of σ. The fourth changes σ by less than 2 %."""
     tolerance: float = 1e-6
-    """m and rad: the search ends after a smaller step. Far below the noise of markers."""
+    """m and rad: the search ends after a smaller step. It is far below the noise of markers."""
     max_iterations: int = 60
     """Largest number of steps per estimate of σ. Searches that converge need fewer than 20."""
 
@@ -101,7 +103,6 @@ class Registration:
         noise: label -> its deviation σ about the fitted leg, m.
         joints: "hip" or "ankle" -> its shift in thigh or shank and the deviation, m, (3,) each.
         offset: mean offset of AP, SI, ML (m), axial rotation and adduction (rad), (5,).
-        offset_deviation: its deviation, (5,).
         knee_distance: median distance of the knee centres of shank and thigh before and after, m.
         knee_centre: deviation of the knee's centre, as the shank's markers place it, in the axes
             of the shank, m, (3,).
@@ -123,7 +124,7 @@ class Registration:
     trials: tuple[str, ...]
 
     def rms(self, residuals: dict[str, float]) -> float:
-        """Return the root mean square of the residuals of shank and thigh, m."""
+        """Return the root mean square over shank and thigh, m."""
         labels = [k for s in self.segments if s.name in ("shank", "thigh") for k in s.points]
         return float(np.sqrt(np.mean([residuals[label] ** 2 for label in labels])))
 
@@ -132,7 +133,7 @@ class Registration:
         return 1.0 - float(np.mean(self.deviation[label] ** 2)) / self.prior[label] ** 2
 
     def shift(self, label: str, model: Sequence[ModelSegment]) -> Array:
-        """Return the shift (3,) m of a marker from its position in the model's segments."""
+        """Return the shift (3,) m of a marker from the model's position."""
         first, last = (
             next(s.points[label] for s in segments if label in s.points)
             for segments in (model, self.segments)
@@ -148,8 +149,8 @@ def register(
     Args:
         links: links of the leg; a left leg is not mirrored.
         segments: "shank" and "thigh", and their neighbours, with the model's markers.
-        trials: name of a trial -> segment -> measured markers (n, m, 3), m, in the laboratory, gaps
-            NaN, in the order of the segment's points.
+        trials: trial -> segment -> measured markers (n, m, 3), m, in the laboratory, gaps NaN, in
+            the order of the segment's points.
     """
     leg = _MarkedLeg(links, segments)
     measured = _chosen_frames(leg, trials)
@@ -193,10 +194,9 @@ def register(
 def misfit(
     links: Links, segments: Sequence[ModelSegment], measured: dict[str, Array]
 ) -> tuple[float, float]:
-    """Return how far the markers of a trial misfit the model.
+    """Return how far the markers of a trial misfit the model's segments.
 
     Args:
-        segments: segments with the model's markers.
         measured: segment -> measured markers (n, m, 3), m.
 
     Returns:
@@ -210,7 +210,7 @@ def misfit(
 
 
 def knee_distance(links: Links, fits: dict[str, tuple[Array, dict[str, float]]]) -> float:
-    """Return the median distance (m) of the knee centres that shank and thigh markers give."""
+    """Return the median distance (m) of the knee centres by shank and thigh markers."""
     knee = inverse(fits["shank"][0] @ links.insert_in_tibia) @ fits["thigh"][0]
     return float(np.nanmedian(np.linalg.norm(knee[:, :3, 3] - links.neutral[:3], axis=1)))
 
@@ -274,7 +274,6 @@ class _MarkedLeg:
         return np.concatenate([np.repeat(scale * wide, 3), self.held])
 
     def moved(self, theta: Array) -> list[ModelSegment]:
-        """Return the segments with markers and joints shifted by θ."""
         shifts, k, found = theta[: 3 * self.markers].reshape(-1, 3), 0, []
         parts = {s.name: part for s, part in self.joint_parts}
         for s in self.segments:
@@ -287,7 +286,7 @@ class _MarkedLeg:
         return found
 
     def start(self, fits: dict[str, tuple[Array, dict[str, float]]]) -> Array:
-        """Return an initial guess (f, nq) from the rigid fits of the segments."""
+        """Return (f, nq) from the rigid fits of the segments."""
         poses = {name: fit[0] for name, fit in fits.items()}
         shank, thigh = poses["shank"], poses["thigh"]
         q = np.tile(pin.neutral(self.model), (len(shank), 1))
@@ -305,7 +304,7 @@ class _MarkedLeg:
         return q
 
     def at_state(self, q: Array, theta: Array) -> tuple[Array, Array, Array]:
-        """Return marker positions (f, m, 3), Jacobians (f, m, 3, nv) and rotations (f, s, 3, 3)."""
+        """Return marker positions (f, m, 3), Jacobians (f, m, 3, nv), rotations (f, s, 3, 3)."""
         for ball, part in self.joint_parts:
             assert ball.joint is not None
             joint = self.model.jointPlacements[self.joints[ball.name]]
@@ -340,7 +339,7 @@ class _MarkedLeg:
 
 
 def _chosen_frames(leg: _MarkedLeg, trials: dict[str, dict[str, Array]]) -> dict[str, Array]:
-    """Return segment -> measured markers (f, m, 3) of the frames with shank and thigh visible."""
+    """Return segment -> markers (f, m, 3) of the frames with shank and thigh visible."""
     chosen: dict[str, list[Array]] = {s.name: [] for s in leg.segments}
     for markers in trials.values():
         seen = [np.isfinite(markers[n]).all(axis=2).sum(axis=1) >= 3 for n in ("shank", "thigh")]
@@ -359,7 +358,7 @@ def _chosen_frames(leg: _MarkedLeg, trials: dict[str, dict[str, Array]]) -> dict
 def _rigid(
     segments: Sequence[ModelSegment], measured: dict[str, Array]
 ) -> dict[str, tuple[Array, dict[str, float]]]:
-    """Return segment -> rigid fits (f, 4, 4), and label -> root mean square residual, m."""
+    """Return segment -> fits (f, 4, 4), and label -> root mean square residual, m."""
     result = {}
     for s in segments:
         points = np.array(list(s.points.values()))
@@ -406,7 +405,7 @@ def _solved(
 def _equations(
     leg: _MarkedLeg, q: Array, theta: Array, target: Array, noise: Array
 ) -> tuple[float, tuple[Array, Array, Array, Array, Array]]:
-    """Return the cost, and blocks of the normal equations: frames, cross, θ, and right sides."""
+    """Return the cost, and the normal equations' blocks: frames, cross, θ, right sides."""
     x, jacobian, rotations = leg.at_state(q, theta)
     share = min(1.0, REGISTRATION.independent / len(q))
     visible = np.isfinite(target).all(axis=2)
@@ -436,7 +435,7 @@ def _equations(
 def _noise(leg: _MarkedLeg, q: Array, theta: Array, target: Array) -> Array:
     """Return σ (m,) m of each marker in each direction, from its residuals.
 
-    The poses adapt to the markers, so that residuals have too few degrees of freedom.
+    The poses adapt to the markers, so the residuals have too few degrees of freedom.
     """
     x, _, _ = leg.at_state(q, theta)
     square = np.nanmean((target - x) ** 2, axis=(0, 2))

@@ -27,19 +27,18 @@ from tkamb.io.toml_text import toml_markers, toml_mm, toml_value
 from tkamb.units import DEGREE
 
 GROUND_FILE = "ground_reaction.csv"
-"""Name of the file in the scene's folder with a ground reaction that is a sum of table forces."""
+"""File in the scene's folder with a sum of table forces."""
 
 
 @dataclass(frozen=True)
 class Meshes:
-    """Files of the implant's meshes, with their unit and their axes.
+    """Files of the implant, with their unit and axes.
 
     Args:
-        insert: mesh of the insert.
         patella: mesh of the patellar button; None without a button.
         unit: "m", "cm", "mm" or "inch".
         axes: axes of the meshes that point anterior, superior and right, like "+x,+y,+z".
-        femur_bone: mesh of the femur in the axes of the femur's body, for wrapping; None: none.
+        femur_bone: mesh in the axes of the femur's body, for wrapping; None: none.
     """
 
     femoral: Path
@@ -79,7 +78,6 @@ class MarkerFile:
 
     Args:
         axes: axes of the file that point forward, up and right.
-        method: fit of the markers, "segments" or "chain".
         knee: joint of the chain, "hinge" or "free".
         interval: start and end, s; None: the whole recording.
         frames: number of frames at equal intervals; None: all frames of the recording.
@@ -100,23 +98,20 @@ class MarkerFile:
 
 @dataclass(frozen=True, eq=False)
 class SceneText:
-    """Content of the scene.
+    """Content of the scene; None: without.
 
     The motion comes from `markers` or `poses`, and from `motion.csv` if there is neither.
 
     Args:
         folder: folder in which the scene will be written; paths in the scene are relative to it.
-        side: side of the knee, "left" or "right".
         markers: recording of markers for knee and shank, or None.
         poses: recorded poses of the femoral component, or None.
         shank: markers that give the shank's pose, or None; needed with `poses`.
-        ground: the ground reaction, or None.
-        meshes: meshes of the implant, or None.
         activity: activity whose published peaks the report shows; None: no peaks.
         model: the .osim file, if all its muscles act; None: only the quadriceps acts.
         coordinates: file of the model's coordinates; None: they are fitted to the markers.
-        cycle: times of 0 and 100 % of the gait cycle, s; "plates": from foot strikes on the
-            plates; None: results are shown over time.
+        cycle: times of 0 and 100 % of the gait cycle, s; "plates": from foot strikes on the plates;
+            None: results are shown over time.
         uncertainty: deviations that a registration of the markers gives, as in [uncertainty].
     """
 
@@ -182,7 +177,7 @@ class ImportRequest:
     """The files and options of an import. None: the option is inferred or not used.
 
     Args:
-        side: side of the knee, "left" or "right".
+        side: "left" or "right".
         recording: .c3d or .trc file of markers, or .mot or .sto file of the model's coordinates.
         grf: table of ground reactions, used instead of a C3D file's plates.
         grf_force: names of the foot's forces in the table `grf`, separated by commas. A force's
@@ -203,7 +198,7 @@ class ImportRequest:
         cutoff_Hz: cut-off frequency of the low-pass filter of markers and plates.
         activity: activity whose published peaks the report shows; None: no peaks.
         prefix: prefix of the markers to use, if a label occurs with several prefixes.
-        muscles: whether all muscles of the model share the load; otherwise only the quadriceps.
+        muscles: whether all muscles share the load, or only the quadriceps.
         cycle: times of 0 and 100 % of the gait cycle, s; "plates": two foot strikes on the plates.
         units: units that the user states because the file of the recording does not.
     """

@@ -134,7 +134,7 @@ def simm_spline(x: Array, y: Array) -> Piecewise:
 
     The third derivative in the first interval is that of the cubic through the first four points.
     The last interval uses the last four points. With three points the third derivative is zero;
-    with two points the spline is a straight line. The spline is not a natural spline.
+    with two points the spline is a straight line. It is not a natural spline.
     """
     if len(x) == 2:
         return piecewise_linear(x, y)
@@ -146,7 +146,7 @@ def simm_spline(x: Array, y: Array) -> Piecewise:
 
 
 def _third_difference(x: Array, y: Array) -> float:
-    """Return the third divided difference of four points, f'''/6 of the cubic through them."""
+    """f'''/6 of the cubic through four points."""
     for order in (1, 2, 3):
         y = np.diff(y) / (x[order:] - x[:-order])
     return float(y[0])
@@ -174,11 +174,8 @@ class MovingPathPoint:
     """A path point whose three components (m) are functions of coordinates.
 
     Args:
-        name: the point's name.
-        body: body in whose frame it moves.
         coordinates: names of the coordinates on which x, y and z depend; None: the function is
             evaluated at zero.
-        functions: functions that give x, y and z, m.
     """
 
     name: str
@@ -196,7 +193,6 @@ class PathWrap:
 
     Args:
         first: index of the first path point of the part that may wrap.
-        last: index of the last path point of this part.
         method: OpenSim's method for an ellipsoid: "hybrid", "midpoint" or "axial".
     """
 
@@ -219,10 +215,8 @@ class OpenSimMuscle:
     """A muscle, with the parameters that all of OpenSim's muscle classes share.
 
     Args:
-        name: the muscle's name.
         kind: the file's class, such as "Thelen2003Muscle".
         max_contraction_velocity: maximum contraction velocity, optimal fibre lengths per second.
-        enabled: whether the muscle is switched on in the file.
     """
 
     name: str
@@ -244,7 +238,6 @@ class OpenSimLigament:
     Ligament is `scale_N` times `force_length(length / slack length)`.
 
     Args:
-        name: the ligament's name.
         kind: "Ligament" or "Blankevoort1991Ligament".
         slack_length_m: greatest length without force.
         stiffness_N: force per unit strain in the linear region, N; None for "Ligament".
@@ -253,7 +246,6 @@ class OpenSimLigament:
         force_length: normalised force as function of normalised length; None for
             "Blankevoort1991Ligament".
         scale_N: factor of the normalised force, N; None for "Blankevoort1991Ligament".
-        enabled: whether the ligament is switched on in the file.
     """
 
     name: str
@@ -276,7 +268,6 @@ class Body:
     """A rigid body.
 
     Args:
-        name: the body's name.
         centre: centre of mass in the body's frame, m, shape (3,).
         inertia: inertia tensor about the centre of mass, kg·m², shape (3, 3).
     """
@@ -292,10 +283,7 @@ class Coordinate:
     """A generalised coordinate, m or rad.
 
     Args:
-        name: the coordinate's name.
         rotational: whether the coordinate is an angle. Files "in degrees" state it in degrees.
-        default: default value.
-        range: smallest and largest value.
         clamped: whether OpenSim restricts the coordinate to the range.
         locked: whether OpenSim fixes the coordinate at its default.
     """
@@ -311,11 +299,10 @@ class Coordinate:
 
 @dataclass(frozen=True, eq=False)
 class JointAxis:
-    """One axis of a joint, with the motion along it as a function of one coordinate.
+    """One axis of a joint, with the motion along it as a function of one coordinate; None: at zero.
 
     Args:
-        direction: unit vector of the axis, shape (3,).
-        coordinate: the coordinate's name; None: the function is evaluated at zero.
+        direction: unit vector (3,).
         function: function of the coordinate, which gives the angle (rad) or translation (m).
     """
 
@@ -332,14 +319,9 @@ class Joint:
     rotations about single axes. Its translation is t = Σ u_i a_i along the axes a_i.
 
     Args:
-        name: the joint's name.
         kind: the file's class, such as "PinJoint".
-        parent: body of the parent frame.
-        child: body of the child frame.
         pose_parent_frame: pose of the parent frame in the parent body, shape (4, 4).
         pose_child_frame: pose of the child frame in the child body, shape (4, 4).
-        rotations: up to three rotation axes.
-        translations: up to three translation axes.
         backwards: whether the child body is nearer to ground than the parent body.
         unread: reason for which the joint's motion could not be read. Such a joint is welded.
             "": the motion was read.
@@ -369,7 +351,7 @@ class Joint:
 
 @dataclass(frozen=True, eq=False)
 class CoordinateCoupler:
-    """An enforced constraint dependent = function(independent) between coordinates, rad and m."""
+    """An enforced constraint dependent = function(independent), rad and m."""
 
     name: str
     dependent: str
@@ -379,7 +361,7 @@ class CoordinateCoupler:
 
 @dataclass(frozen=True, eq=False)
 class ConstantDistance:
-    """A constraint that two points (3,), m, of two bodies have a constant `distance`, m."""
+    """Two points (3,), m, of two bodies have a constant `distance`, m."""
 
     name: str
     bodies: tuple[str, str]
@@ -404,7 +386,6 @@ class Unread:
 
     Args:
         kind: the file's class.
-        concerns: names of the bodies and coordinates that occur in the element.
     """
 
     kind: str
@@ -420,7 +401,7 @@ class Unread:
 
 @dataclass(frozen=True, eq=False)
 class OpenSimModel:
-    """An OpenSim model.
+    """Units are SI.
 
     Args:
         gravity: acceleration of gravity in ground, m/s², shape (3,). It is along -y: the file's
@@ -430,11 +411,7 @@ class OpenSimModel:
         coordinates: name -> coordinate, in the file's order. Every vector q has this order.
         couplers: couplers of coordinates, ordered so that each coordinate is set before the
             coordinates that depend on it.
-        constant_distances: constraints on the distance between two points.
-        markers: name -> marker.
-        muscles: name -> muscle.
-        ligaments: name -> ligament.
-        wrap_objects: name -> wrap object.
+        constant_distances: distances between two points.
         offset_frames: name of an offset frame -> its body, and its pose (4, 4) in that body.
         left_out: "class 'name'" of each element of the file that tkamb does not model.
         unread: elements that a partial reading could not read.

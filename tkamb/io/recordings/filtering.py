@@ -99,7 +99,7 @@ def differentiate_poses(
     """Low-pass filter poses of a body and differentiate them twice.
 
     Positions are filtered as coordinates, and orientations as sign-continuous quaternions that are
-    normalised afterwards. The result does not depend on the axes of either frame. Only the
+    normalised afterwards. The result does not depend on the axes of either frame, only the
     positions depend on the body's origin. With s the filtered quaternion,
 
         omega = 2 vec(s* s') / |s|^2,   alpha = 2 vec(s* s'') / |s|^2 - 2 omega (s . s') / |s|^2
@@ -133,14 +133,14 @@ def differentiate_poses(
 
 
 def _continuous(quaternions: Array) -> Array:
-    """Return the quaternions (n, 4) with signs that make consecutive rows continuous."""
+    """Return quaternions (n, 4) with signs that make consecutive rows continuous."""
     turns = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
     signs = np.cumprod(np.where(np.concatenate([[False], turns]), -1.0, 1.0))
     return np.asarray(quaternions * signs[:, None])
 
 
 def _relative_vector(s: Array, r: Array) -> Array:
-    """Return the vector part of conj(s) r for quaternions (f, 4), scalar last."""
+    """Return the vector part (f, 3) of conj(s) r, scalar last."""
     sv, sw, rv, rw = s[:, :3], s[:, 3:], r[:, :3], r[:, 3:]
     return np.asarray(sw * rv - rw * sv - np.cross(sv, rv))
 
@@ -169,11 +169,11 @@ def _check_samples(time: Array, values: Array, at: Array, name: str) -> None:
 def check_frames(time: Array, cutoff_Hz: Cutoff, frames: int | None) -> None:
     """Raise an InputError if the resampled times (f,) s are too far apart for the cut-off.
 
-    A recording is filtered at its own samples before it is resampled. Results at the frames (a
-    solved patella, a rolling femur) are filtered at the rate of the frames.
+    A recording is filtered at its own samples before it is resampled; results at the frames (a
+    solved patella, a rolling femur) are filtered at the frames' rate.
 
     Args:
-        frames: the scene's [motion] frames; None: the motion is not resampled.
+        frames: [motion] frames; None: not resampled.
     """
     if frames is None or cutoff_Hz == "none":
         return
@@ -223,7 +223,7 @@ def _interpolating_spline(time: Array, values: Array, periodic: bool) -> "BSplin
 
 
 def _smoothing_spline(time: Array, values: Array, cutoff_Hz: float, periodic: bool) -> "BSpline":
-    """Return the penalised least-squares spline of the module's equation."""
+    """Return the spline of the module's equation."""
     from scipy.interpolate import BSpline
     from scipy.sparse.linalg import splu
 
@@ -254,9 +254,8 @@ def _smoothing_spline(time: Array, values: Array, cutoff_Hz: float, periodic: bo
 def _third_derivative_gram(spans: int, step: float) -> sp.csr_array:
     """Return the integrals of B_i''' B_j''' over all spans of uniform knots.
 
-    The third derivative of a spline of degree five is a spline of degree two. Its coefficients are
-    the third differences of the original coefficients, divided by step^3. Three Gauss points per
-    span integrate the products exactly.
+    B_i''' is of degree two: its coefficients are the third differences of the original ones,
+    divided by step^3, and three Gauss points per span integrate the products exactly.
     """
     from scipy.interpolate import BSpline
 
@@ -289,8 +288,7 @@ class OddSample:
     """A sample off its neighbours' curve.
 
     Args:
-        what: the quantity, like "flexion".
-        time: s, time of the sample.
+        time: s.
         away: distance from the curve, in `unit`.
         unit: unit of `away`, like "mm".
     """
@@ -312,7 +310,6 @@ def odd_samples(
         values: (n,) SI.
         floor: smallest deviation of an odd sample, SI.
         scale: SI per `unit`.
-        unit: unit of the deviation in messages.
     """
     if len(time) < 6:
         return ()
@@ -326,7 +323,7 @@ def odd_samples(
 
 
 def neighbours_curve(time: Array, values: Array) -> Array:
-    """Return, at each sample, the cubic (n,) through its four neighbours (two on either side)."""
+    """Return the cubic (n,) through each sample's four neighbours, two on either side."""
     n = len(time)
     first = np.clip(np.arange(n) - 2, 0, n - 5)
     others = first[:, None] + np.arange(5)
@@ -348,7 +345,7 @@ def _running_median(away: Array) -> Array:
 
 
 def check_spacing(path: Path, time: Array) -> None:
-    """Raise an InputError if samples at times (n,) s are no movement: one, or too far apart."""
+    """Raise an InputError if times (n,) s are no movement: one, or too far apart."""
     if len(time) == 1:
         what = f"has one row, at {time[0]:g} s, which is no movement"
         raise InputError(what, path, "give a recording of several rows")
@@ -398,9 +395,9 @@ def check_steps(
 def check_range(
     path: Path, what: str, values: Array, limits: tuple[float, float], unit: str, hint: str
 ) -> None:
-    """Raise an InputError with a hint if values (n,) are outside `limits`, both in `unit`.
+    """Raise an InputError with a hint if values (n,) leave `limits`, both in `unit`.
 
-    `what` is the part of the body and the quantity, like "knee: flexion".
+    `what` is like "knee: flexion".
     """
     low, high = limits
     outside: NDArray[np.bool_] = ~((values >= low) & (values <= high))

@@ -13,19 +13,19 @@ channels give the force and the moment about the transducers' origin in these ax
     type 5   as type 2 after a calibration matrix (6, 8) of eight channels
 
 A calibration matrix gives forces in N (or FORCE_PLATFORM:UNITS) and moments in that unit times
-POINT:UNITS. The channels of a type 4 plate may state other units. The units that put the centre of
-pressure on the plate are then used.
+POINT:UNITS. A type 4 plate may state other units; the units that put the centre of pressure on the
+plate are then used.
 
-ORIGIN is the vector o from the transducers' origin to the centre of the surface. The moment about
-this centre is M - o × F. The centre of pressure is not returned: it needs a force threshold.
+ORIGIN is the vector o from the transducers' origin to the surface's centre, about which the moment
+is M - o × F.
 
 FORCE_PLATFORM:ZERO names frames without load. The mean of each channel over these frames is
 subtracted, unless the plate is loaded in them.
 
 Source: C3D user guide, FORCE_PLATFORM; Kistler's formulae for four three-component sensors.
 
-A plate states its moments, or its points, in a unit of length. If this unit is wrong, the centre of
-pressure leaves the surface, or it rests at the transducers' origin as no foot does.
+If the unit of length of its moments or points is wrong, the centre of pressure leaves the surface,
+or it rests at the transducers' origin as no foot does.
 """
 
 import logging
@@ -56,7 +56,7 @@ MOVING = 0.05
 
 
 USUAL, UNUSUAL = ("mm", "m"), ("cm", "inch")
-"""Units of length in moments, which are tried in this order if the stated one is impossible."""
+"""Units of length in moments, tried in this order if the stated one is impossible."""
 
 
 @dataclass(frozen=True)
@@ -78,12 +78,12 @@ class PressureRange:
 
     @property
     def resting(self) -> bool:
-        """Whether the centre of pressure rests at the transducers' origin."""
+        """Whether the centre of pressure stays at the transducers' origin."""
         return bool((self.origin < RESTING).all())
 
     @property
     def usual(self) -> bool:
-        """Whether the centres of pressure are those of a foot on the plate."""
+        """Whether a foot on the plate has such centres of pressure."""
         return not self.beside and bool((self.origin > MOVING).any())
 
 
@@ -110,7 +110,7 @@ def pressure_range(
 
 
 def other_units(stated_m: float) -> Iterator[tuple[tuple[str, float], ...]]:
-    """Yield groups of names and metres of units of length other than the stated one (m)."""
+    """Yield groups of (name, metres) of other units of length than the stated one (m)."""
     for names in (USUAL, UNUSUAL):
         units = tuple((name, LENGTH[name]) for name in names)
         yield tuple(unit for unit in units if abs(unit[1] / stated_m - 1.0) > 1e-6)
@@ -139,14 +139,11 @@ class PlateRecord:
 
     Args:
         number: number of the plate, from 1.
-        kind: type of the plate, 1 to 5.
+        kind: 1 to 5.
         corners: (4, 3) m, corners of the surface.
         origin: (3,) m, the file's ORIGIN.
         signals: (c, k) samples of the channels, in the file's units.
-        units: units of the channels, as in the file.
         calibration: (6, c), matrix from channels to force and moment (types 4 and 5), or None.
-        force_unit: unit of the calibrated forces.
-        metres_per_unit: metres per unit of length of the file.
         zero: samples in which the file states the plate as unloaded, or None.
         given: the user's units.
         moment_length: metres that stand for the length in moments, or in the points of type 1 and
@@ -174,7 +171,6 @@ class ForcePlate:
     """One plate, in the axes of the file.
 
     Args:
-        number: number in the file, from 1.
         corners: (4, 3) m, corners of the surface.
         force: (k, 3) N, on the foot; NaN where the file has no value.
         moment: (k, 3) N·m, on the foot, about the centre of the surface.
@@ -237,8 +233,8 @@ def _in_possible_unit(
 ) -> tuple[Array, Array, tuple[str, ...]]:
     """Return force and moment in the unit that puts the centre of pressure on the plate.
 
-    Another unit is used, with a notice, only if the file's unit is impossible and exactly one other
-    is possible. A unit that the user gives is kept.
+    Another unit than the file's is used, with a notice, only if that is impossible and exactly one
+    other is possible. The user's unit is kept.
 
     Args:
         force: (k, 3) N, as stated, in the plate's axes.
@@ -275,7 +271,7 @@ def _in_possible_unit(
 
 
 def _above_transducers(record: PlateRecord) -> Array:
-    """Return the vector (3,) m from the transducers' origin to the surface's centre."""
+    """Return (3,) m from the transducers' origin to the surface's centre."""
     if record.kind == 1:
         return np.zeros(3)
     return record.origin * (np.array([0.0, 0.0, 1.0]) if record.kind == 3 else 1.0)
@@ -292,7 +288,7 @@ def _stated_length(record: PlateRecord) -> float:
 
 
 def _loaded_in_zero(record: PlateRecord, force: Array) -> str:
-    """Return the reason not to subtract the mean over the frames of ZERO, or ""."""
+    """Return why the mean over the frames of ZERO is not subtracted, or ""."""
     assert record.zero is not None
     vertical = force[:, 2]
     window = vertical[record.zero]
@@ -308,9 +304,8 @@ def _loaded_in_zero(record: PlateRecord, force: Array) -> str:
 
 
 def _read(record: PlateRecord) -> tuple[Array, Array, tuple[str, ...]]:
-    """Return force (k, 3) N, moment (k, 3) N·m about the surface's centre, and notices.
-
-    Force and moment are in the plate's axes.
+    """Return force (k, 3) N, moment (k, 3) N·m about the surface's centre, in the plate's axes, and
+    notices.
     """
     length = record.moment_length
     if record.kind not in _CALIBRATED:
@@ -350,13 +345,13 @@ def _read(record: PlateRecord) -> tuple[Array, Array, tuple[str, ...]]:
 
 
 def _on_plate(record: PlateRecord, force: Array, moment: Array) -> bool:
-    """Return whether the centre of pressure is on the plate, or the plate is not loaded."""
+    """Return whether the centre of pressure is on the plate; true if it is not loaded."""
     where = pressure_range(record.corners, force, moment, _above_transducers(record))
     return where is None or where.usual
 
 
 def _wrench(kind: int, s: Array, origin: Array) -> tuple[Array, Array]:
-    """Return force and moment about the surface's centre, each (k, 3), in the plate's axes."""
+    """Return force and moment about the surface's centre, (k, 3), in the plate's axes."""
     if kind == 3:
         a, b = origin[0], origin[1]
         force = np.stack([s[0] + s[1], s[2] + s[3], s[4:8].sum(axis=0)], axis=1)
@@ -459,12 +454,7 @@ UNLOADED_S = 0.1
 
 
 def around_load(force: Array, time: Array) -> np.ndarray:
-    """Return whether each sample (k,) is loaded, or within `margin_s` of a loaded sample.
-
-    Args:
-        force: (k,) N, magnitude of the force on the plate.
-        time: (k,) s.
-    """
+    """Return whether each sample of a force (k,), N, is within `margin_s` of a loaded one."""
     forces = np.sort(force[np.isfinite(force)])
     smallest = forces[: math.ceil(QUIET_SHARE * len(forces))]
     steady = len(smallest) and np.ptp(smallest) <= QUIET_SPREAD_N and smallest[-1] <= MOST_DRIFT_N

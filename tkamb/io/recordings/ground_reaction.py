@@ -1,14 +1,13 @@
 """The ground reaction on the foot, from one force plate or from plates that share the load.
 
-The centre of pressure is a quotient, M/F, which is undefined at F = 0. Therefore force and moment
-about the laboratory's origin are filtered. The centre of pressure follows from the filtered values,
-at the plate's level h:
+The centre of pressure is a quotient, M/F, so force and moment about the laboratory's origin are
+filtered instead. It follows from the filtered values, at the plate's level h:
 
     x = (M_z + h F_x) / F_y,   z = (h F_z - M_x) / F_y,   T_y = M_y - (z F_x - x F_z)
 
 While the vertical force is below `unloaded_N`, the point is interpolated linearly in time between
-the loaded samples before and after. The moment is then about this point. The wrench itself does
-not change.
+the loaded samples before and after. The moment is then about this point; the wrench itself does not
+change.
 """
 
 from dataclasses import dataclass, field, replace
@@ -36,7 +35,7 @@ from tkamb.io.recordings.tables import Table, read_table
 from tkamb.units import MILLIMETRE
 
 DIRECTIONS = ("forward", "upward", "rightward")
-"""Names of the laboratory's axes in messages. A file may have other axes."""
+"""The laboratory's axes in messages; a file may have others."""
 
 
 # m: largest change of height of the centre of pressure on a level plate, and largest height
@@ -76,8 +75,8 @@ class GroundReaction:
         loaded: (f,) whether the vertical force is at least `unloaded_N`.
         odd: recorded samples around the frames that lie off the curve of their neighbours.
         level_assumed: whether the plate's height is assumed to be 0, because no column states it.
-        drift: number of a plate -> vertical force of the unloaded plate, N, if it is large.
-        remarks: notices on the file and on the parts of it that were used.
+        drift: plate's number -> its vertical force when unloaded, N, if large.
+        remarks: notices on the file and its used parts.
         gait: stances in the recording; None if not computed.
     """
 
@@ -94,16 +93,14 @@ class GroundReaction:
 
 @dataclass(frozen=True, eq=False)
 class RecordedReaction:
-    """A foot's ground reaction as recorded, in the axes of the laboratory.
+    """A foot's ground reaction as recorded, in the laboratory's axes.
 
     Args:
         time: (k,) s.
         force: (k, 3) N.
         point: (k, 3) m.
         moment: (k, 3) N·m about `point`.
-        level_assumed: whether no column states the plate's height.
         drift: as in `GroundReaction`.
-        remarks: as in `GroundReaction`.
     """
 
     time: Array
@@ -124,8 +121,7 @@ def load_ground_reaction(source: GroundReactionTable, time: Array, side: Side) -
     """Return the ground reaction at the frames of the knee's motion.
 
     Args:
-        source: the scene's [ground_reaction].
-        time: (f,) s of the frames, on the file's clock.
+        time: (f,) s, on the file's clock.
         side: side of the knee; a left foot is mirrored.
     """
     from_plates = _is_c3d(source)
@@ -170,7 +166,7 @@ def load_ground_reaction(source: GroundReactionTable, time: Array, side: Side) -
 def recorded_wrench(source: GroundReactionTable) -> tuple[Array, Array, float]:
     """Return times (k,) s, wrench on the foot (k, 6) N and N·m, and plate level (m) of a table.
 
-    The wrench is in the laboratory's axes, about the laboratory's origin.
+    The wrench is about the laboratory's origin, in its axes.
     """
     recorded = _read_table(source)
     _check_upward(recorded.force, source)
@@ -184,10 +180,10 @@ def recorded_wrench(source: GroundReactionTable) -> tuple[Array, Array, float]:
 def _reference_points(
     recorded: RecordedReaction, loaded: np.ndarray, path: Path
 ) -> tuple[Array, Array]:
-    """Return the centres of pressure and the reference points of the moments, each (k, 3) m.
+    """Return centres of pressure and reference points of the moments, (k, 3) m.
 
-    Centres of pressure of the unloaded plate are interpolated. They are the reference points,
-    except in rows with a horizontal moment: its reference point is the recorded point.
+    Unloaded centres are interpolated and are the reference points, except in rows with a horizontal
+    moment: there it is the recorded point.
     """
     interpolated = _interpolate_unloaded(recorded.time, recorded.point, loaded, path)
     horizontal = np.abs(recorded.moment[:, [0, 2]]) > MOMENT_TOLERANCE
@@ -269,10 +265,10 @@ def _odd_samples(
     loaded: np.ndarray,
     cutoff: Cutoff,
 ) -> tuple[OddSample, ...]:
-    """Return the odd samples of force and recorded point (n, 3) while the plate is loaded.
+    """Return the odd samples of force and recorded point (n, 3) under load.
 
-    The low-pass filter spreads one sample over the time 1 / (2 cutoff). Odd forces that are small
-    after filtering are not returned.
+    The low-pass filter spreads one sample over the time 1 / (2 cutoff); forces that are small
+    afterwards are not returned.
     """
     if not loaded.any():
         return ()
@@ -315,7 +311,7 @@ def check_under_foot(ground: GroundReaction, ankle: Array, path: Path) -> None:
 
 
 def _upright_point(source: GroundReactionTable) -> str:
-    """Return the role of the height of the centre of pressure. Its column may be missing."""
+    """Return the role of the centre of pressure's height, whose column may be missing."""
     return f"point_{'xyz'.index(source.laboratory_axes.split(',')[1][-1]) + 1}"
 
 
@@ -355,11 +351,9 @@ def _check_size(path: Path, kind: str, column: str, values: Array) -> None:
 
 
 def _read_plates(source: GroundReactionTable) -> RecordedReaction:
-    """Return the ground reaction of a recording's plates.
-
-    The wrenches of the loaded plates are summed about the laboratory's origin. The point lies on
-    the plates' surface, or on a step that is `surface_mm` higher. It is interpolated in time while
-    the vertical force is below `unloaded_N`.
+    """The loaded plates' wrenches are summed about the laboratory's origin. The point lies on the
+    plates' surface, or on a step `surface_mm` higher, and is interpolated in time below
+    `unloaded_N`.
     """
     recording = read_c3d(source.file, _units(source))
     check_roles(source.columns, (), source.file, "ground_reaction")
@@ -422,10 +416,7 @@ def summed_reaction(
 
 
 def _centre_of_pressure(force: Array, about_origin: Array, level: float) -> Array:
-    """Return the points (k, 3) m at a level (m) about which the moment is vertical.
-
-    The equation is in the docstring of the module.
-    """
+    """Return (k, 3) m at a level (m) about which the moment is vertical; see the module."""
     fx, fy, fz = force.T
     x = (about_origin[:, 2] + level * fx) / fy
     z = (level * fz - about_origin[:, 0]) / fy

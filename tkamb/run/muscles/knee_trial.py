@@ -2,8 +2,8 @@
 
 The OpenSim model provides the rows of hip, ankle and subtalar joint. In each frame the equations of
 tkamb's knee provide the row of the knee: the moment, the moment arm of the extensor group and the
-moment arms of the muscles that cross the knee (`tkamb.knee.crossing`). `LegRecording` names the
-files of model, motion and ground reaction. `load_knee_trial` reads them.
+moment arms of the muscles that cross the knee (`tkamb.knee.crossing`). `load_knee_trial` reads
+model, motion and ground reaction.
 
 Contact, ligaments, muscles, patellar ligament and the load from outside balance on the shank. Let
 W be the wrench of all loads but contact, about a point at the height of the contact. With the
@@ -61,9 +61,9 @@ class CondyleRows:
     """The normal forces of the medial and the lateral condyle, affine in the muscle forces.
 
     Args:
-        constant: forces without muscles, N, shape (2,).
-        extensor: change per newton of the extensor group, shape (2,).
-        arms: change per newton of the crossing muscles, shape (2, c).
+        constant: forces without muscles, N, (2,).
+        extensor: change per newton of the extensor group, (2,).
+        arms: change per newton of the crossing muscles, (2, c).
     """
 
     constant: Array
@@ -79,10 +79,10 @@ class CondyleRows:
 def condyle_rows(
     geometry: KneeGeometry, lines: CrossingLines, points: Mapping[str, Array]
 ) -> CondyleRows | None:
-    """Return the condyles' normal forces; None: no condyle is in contact, or no patella was found.
+    """Return the condyles' normal forces; None: no condyle in contact, or no patella found.
 
-    The contact point of a condyle that is off the insert is the mirror image of the other one about
-    the femoral component's centre.
+    A condyle off the insert gets the other's contact point, mirrored about the femoral component's
+    centre.
 
     Args:
         geometry: the frame with an extensor mechanism; its contact and muscle forces are not used.
@@ -116,7 +116,7 @@ def _wrench(load: PointForces) -> Array:
 
 
 def _split(points: Mapping[str, Array], centre: float) -> Array:
-    """Return the matrix (2, 6) from W about the insert's origin to N of both sides."""
+    """Return (2, 6) from W about the insert's origin to N of both sides."""
     height = float(np.mean([point[1] for point in points.values()]))
     one, other = SIDES
     z = {side: float(point[2]) for side, point in points.items()}
@@ -128,7 +128,7 @@ def _split(points: Mapping[str, Array], centre: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class KneeTrial:
-    """The optimisation problems of all frames, and the muscle lines across the knee.
+    """The problems of all frames, and the muscle lines across the knee.
 
     Args:
         problems: problems of all frames. Their row of the knee's flexion is not used.
@@ -137,7 +137,7 @@ class KneeTrial:
         crossing: indices of the other muscles that cross the knee, (c,).
         shank: points where the crossing muscles leave shank or foot, tibia link, m, (f, c, 3).
         thigh: points where these muscles reach thigh or pelvis, femur link, m, (f, c, 3).
-        groups: name of a group -> names of its muscles, see `muscle_groups`.
+        groups: group -> names of its muscles, see `muscle_groups`.
         knee: pose of the femur link in the tibia link for which the points were computed,
             (f, 4, 4); None: unknown.
     """
@@ -162,7 +162,6 @@ class KneeTrial:
         Args:
             strength: factors of the muscles' active and passive strength, (m,).
             shank: shifts of the points where lines leave the shank, m, (m, 3).
-            thigh: shifts of the points where lines reach the thigh, m, (m, 3).
         """
         muscles = [
             replace(muscle, max_isometric_force_N=float(factor) * muscle.max_isometric_force_N)
@@ -189,9 +188,7 @@ class KneeTrial:
         arms: Array,
         least: CondyleRows | None = None,
     ) -> tuple[FrameProblems, tuple[Array, Array, float, str]]:
-        """Return the problem of frame k with the knee's row, and its solution.
-
-        The solution has the form of `FrameProblems.solved`.
+        """Return the problem of frame k with the knee's row, and `FrameProblems.solved`.
 
         Args:
             moment: moment of muscles and reserve at the knee, N·m.
@@ -220,7 +217,7 @@ class KneeTrial:
         return frame, frame.solved(0)
 
     def _gain(self, rows: CondyleRows) -> Array:
-        """Return the changes (2, m) of the condyles' loads per newton of each muscle."""
+        """Return the changes (2, m) of the condyles' loads per newton."""
         gain = np.where(self.extensor, rows.extensor[:, None], 0.0)
         gain[:, self.crossing] = rows.arms
         return gain
@@ -236,7 +233,6 @@ def knee_trial(
     """Return the muscles of a leg over a motion, for tkamb's knee with its own patella.
 
     Args:
-        motion: coordinates of the OpenSim model over time.
         loads: name of a body -> external wrenches, (f, 6), as in `solve_trial`.
     """
     leg = links.leg
@@ -262,7 +258,7 @@ def knee_trial(
 def _crossing_lines(
     links: Links, bones: Bones, extensor: np.ndarray
 ) -> tuple[np.ndarray, Array, Array]:
-    """Return the indices of the muscles across the knee, and their ends on shank and thigh."""
+    """Return the muscles across the knee, and their ends on shank and thigh."""
     parts = bones.crossings
     below = np.isin(parts.bodies, [bones.index("tibia"), bones.index("foot")])
     above = np.isin(parts.bodies, [bones.index("femur"), -1])
@@ -293,7 +289,7 @@ def _crossing_lines(
 
 @dataclass(frozen=True, eq=False)
 class LegRecording:
-    """The files and options from which a leg and its muscles are read.
+    """Files and options of a leg and its muscles.
 
     Args:
         coordinates: path of a .mot or .sto file of the model's coordinates; None: the coordinates
@@ -343,7 +339,7 @@ def load_knee_trial(source: LegRecording, time: Array) -> tuple[Links, KneeTrial
 
 
 def group_names(model: Path, side: Side) -> tuple[str, ...]:
-    """Return the names of the muscle groups of a leg, see `muscle_groups`."""
+    """Return the muscle groups of a leg, see `muscle_groups`."""
     leg = _read_leg(model, side)
     return tuple(muscle_groups(leg, [leg.model.muscles[name] for name in leg_muscles(leg)]))
 

@@ -46,16 +46,14 @@ OPTIMAL = 1
 
 @dataclass(frozen=True, eq=False)
 class LoadSharing:
-    """The optimisation problem of one frame, in the symbols of the module's docstring.
+    """The optimisation problem of one frame, in the module's symbols.
 
     Args:
         weight: weights w > 0, (n,).
         lowest: least activations, (n,).
-        highest: largest activations, (n,).
         offset: y without muscles, N or N·m, (m,).
         gain: change of y by full activation, N or N·m, (m, n).
         lower: least y, (m,); equal to `upper` for a prescribed y.
-        upper: largest y, (m,).
         reserve: r, N or N·m, (m,); inf: no cost.
         expected: activations e from EMG, (n,).
         spread: standard deviations s, (n,); inf: no EMG.
@@ -110,14 +108,13 @@ class LoadSharing:
 
 @dataclass(frozen=True, eq=False)
 class Shared:
-    """The solution of the optimisation problem of one frame.
+    """The solution of one frame.
 
     Args:
         activation: activations, (n,).
         others: y, N or N·m, (m,).
         own_multiplier: multipliers of the activations' bounds, positive at the upper bound, (n,).
         other_multiplier: multipliers of the bounds of y, 1/N or 1/(N·m), (m,).
-        kkt_residual: relative violation of the optimality conditions, see `kkt_residual`.
     """
 
     activation: Array
@@ -129,12 +126,12 @@ class Shared:
 
 
 def solver_missing() -> InputError:
-    """Return the error for a scene with [muscles] if the solver DAQP is not installed."""
+    """Return the error for [muscles] without the solver DAQP."""
     return not_installed("the solver DAQP", "[muscles]", "muscles")
 
 
 def solver_is_installed() -> bool:
-    """Return whether the solver DAQP is installed. The extra `muscles` installs it."""
+    """Return whether DAQP is installed, by the extra `muscles`."""
     return find_spec("daqp") is not None
 
 
@@ -170,12 +167,11 @@ def share_load(problem: LoadSharing) -> Shared:
 
 
 def kkt_residual(problem: LoadSharing, shared: Shared) -> float:
-    """Return the largest relative violation of the optimality conditions.
+    """Return the largest relative violation of the Karush-Kuhn-Tucker conditions.
 
-    The conditions (Karush, Kuhn and Tucker) are stationarity, feasibility and complementarity.
-    Stationarity means that gradient plus multipliers is zero. Its violation is relative to the
-    largest term of the gradient. Complementarity means that multiplier times distance from the
-    bound is zero.
+    Stationarity (gradient plus multipliers is zero) is relative to the largest term of the
+    gradient. Complementarity means that multiplier times distance from the bound is zero;
+    feasibility is the third.
     """
     a, y = shared.activation, shared.others
     slope = problem.gradient(a)
@@ -199,7 +195,7 @@ def kkt_residual(problem: LoadSharing, shared: Shared) -> float:
 
 
 def _programme(problem: LoadSharing, hessian: Array, gradient: Array) -> tuple[Array, Array, Array]:
-    """Return activations and multipliers of the minimum of 1/2 a.H a + g.a within all bounds."""
+    """Return the minimum of 1/2 a.H a + g.a within all bounds, and its multipliers."""
     try:
         import daqp
     except ImportError:
@@ -231,7 +227,7 @@ def _programme(problem: LoadSharing, hessian: Array, gradient: Array) -> tuple[A
 
 
 def _row_scale(problem: LoadSharing) -> Array:
-    """Return the largest change (m,) of each y by a single muscle, as the scale of its bounds."""
+    """Return the largest change (m,) of each y by one muscle, which scales its bounds."""
     size = np.maximum(np.abs(problem.gain).max(axis=1, initial=0.0), 1e-12)
     return np.asarray(size)
 
@@ -294,15 +290,13 @@ class Sharing:
     """Options of the static optimisation.
 
     Args:
-        muscles: names of the muscles; None: the result of `leg_muscles`.
+        muscles: names; None: the result of `leg_muscles`.
         coordinates: names of the balanced coordinates; None: hip, knee flexion, ankle, subtalar.
         reserve: r, N·m (N for a translation), for all coordinates or by name; None: those of
             `tkamb.run.muscles.leg.default_reserves`. A reserve of this
             size costs as much as one fully active muscle of weight 1. inf: no cost, 0: no reserve.
         exponent: p, at least 2.
         weights: "volume" (optimal fibre length times strength, relative to the mean) or "equal".
-        lowest: least activation.
-        highest: largest activation.
         least_share: least share of each condyle in the load of the knee, see
             `tkamb.run.muscles.knee_trial`; 0: a condyle may lift off. Only for tkamb's own knee.
         law: "isometric" (F_i is the maximal isometric force, without passive force) or "hill", see
@@ -346,12 +340,10 @@ class FrameProblems:
     """The optimisation problems of f frames, m muscles and c coordinates.
 
     Args:
-        muscles: the m muscles.
         coordinates: names of the c balanced coordinates.
         moment: joint moments τ, N·m, (f, c).
         arms: moment arms, m, (f, m, c).
         active: forces at full activation without the passive forces, N, (f, m).
-        passive: passive forces, N, (f, m).
         guide: guidance by EMG; None: without.
         least: offset (r,) N and gain (r, m) of r sums of muscle forces that must not be negative;
             None: without.
@@ -384,7 +376,6 @@ class FrameProblems:
         return *missing, np.nan, f"failed: {reason}"
 
     def _unknown(self, k: int) -> str | None:
-        """Return why frame k cannot be solved; None if it can."""
         if not np.isfinite(self.moment[k]).all():
             return "an external load is unknown"
         for missing, why in (
@@ -419,7 +410,7 @@ class FrameProblems:
         return problem if self.least is None else self._above_least(problem, k)
 
     def _above_least(self, problem: LoadSharing, k: int) -> LoadSharing:
-        """Return the problem with the sums of `least` as further y, without cost."""
+        """Return the problem with `least`'s sums as further y, without cost."""
         assert self.least is not None
         offset, gain = self.least
         without = np.full(len(offset), np.inf)

@@ -51,7 +51,7 @@ from tkamb.run.muscles.sharing import FrameProblems, Sharing
 
 @dataclass(frozen=True, eq=False)
 class Attachments:
-    """Effective attachments of muscles on a bone for pulls towards another bone.
+    """Effective attachments of muscles on one bone for pulls towards another.
 
     Args:
         points: attachments in the frame of the bone, m, (f, m, 3); NaN for a muscle without a
@@ -65,11 +65,10 @@ class Attachments:
 
 @dataclass(frozen=True, eq=False)
 class Bones:
-    """The b bones of a leg and their loads. Wrenches have the moment first.
+    """The bones of a leg (femur, patella, tibia, foot) and their loads. The wrenches of the m
+    `muscles` and b bones have the moment first.
 
     Args:
-        names: names of the bones, such as femur, patella, tibia, foot.
-        muscles: names of the m muscles.
         poses: pose of each bone's first body in ground, (f, b, 4, 4).
         pulls: wrench of unit tension of each muscle on each bone, in ground about its origin,
             (f, m, b, 6).
@@ -88,7 +87,8 @@ class Bones:
     def pull_on(self, bones: Sequence[str], seen_from: str) -> Array:
         """Return the wrench (f, m, 6) of unit tension of each muscle on some bones together.
 
-        Moment (N·m per N) and force (N per N), in the frame of bone `seen_from` about its origin.
+        It has moment (N·m per N) and force (N per N) in the frame of bone `seen_from`, about its
+        origin.
         """
         total = self.pulls[:, :, [self.index(name) for name in bones]].sum(axis=2)
         return self._seen(total, seen_from)
@@ -99,13 +99,12 @@ class Bones:
         return self._seen(total[:, None], seen_from)[:, 0]
 
     def attachments(self, bone: str, towards: str | None) -> Attachments:
-        """Return the effective attachments of muscles on a bone, for pulls towards another bone.
+        """Return the effective attachments for pulls towards another bone.
 
-        If a muscle has several straight parts between the bones, the last one counts. `pull_on`
-        sums over all parts.
+        Of several straight parts between the bones the last one counts; `pull_on` sums over all.
 
         Args:
-            towards: name of the other bone; None: any body outside the leg, such as the pelvis.
+            towards: other bone; None: any body outside the leg, such as the pelvis.
         """
         bone_index = self.index(bone)
         other_index = -1 if towards is None else self.index(towards)
@@ -132,7 +131,7 @@ class Bones:
         return self.names.index(name)
 
     def _seen(self, wrench: Array, bone: str) -> Array:
-        """Transform wrenches (f, k, 6) from ground, about its origin, to a bone's frame."""
+        """Transform wrenches (f, k, 6) from ground to a bone's frame."""
         pose = self.poses[:, self.index(bone)]
         moment = wrench[..., :3] - np.cross(pose[:, None, :3, 3], wrench[..., 3:])
         rotation = pose[:, :3, :3]
@@ -171,8 +170,8 @@ class MuscleTrial:
     def muscle_wrench(self, bones: tuple[str, ...], seen_from: str) -> Array:
         """Return the wrench (f, 6) of all muscles on some bones together.
 
-        Moment (N·m) and force (N), in the frame of bone `seen_from` about its origin. On tibia and
-        foot together, only muscles that cross the knee contribute.
+        It has moment (N·m) and force (N) in the frame of bone `seen_from`, about its origin. On
+        tibia and foot together, only muscles across the knee contribute.
         """
         pull = self.bones.pull_on(bones, seen_from)
         return np.einsum("fm,fmi->fi", self.force_N, pull)
@@ -180,8 +179,8 @@ class MuscleTrial:
     def knee_reaction(self) -> Array:
         """Return the wrench (f, 6) of the femur on the tibia without the muscles, mainly contact.
 
-        Moment (N·m) and force (N), in the tibia's frame about its origin. It is the wrench that the
-        motion of tibia and foot requires, minus gravity, external loads and muscles.
+        It is what the motion of tibia and foot requires minus gravity, external loads and muscles:
+        moment (N·m) and force (N) in the tibia's frame, about its origin.
 
         Raises:
             InputError: muscles end on the patella, and the force of the patellar ligament is
@@ -254,11 +253,10 @@ def solve_trial(
 def trial_problems(
     leg: Leg, motion: CoordinateMotion, loads: Mapping[str, Array], sharing: Sharing
 ) -> tuple[FrameProblems, Bones]:
-    """Return the optimisation problems of all frames, and the bones with their loads.
+    """Return the problems of all frames, and the bones with their loads.
 
     Args:
-        motion: coordinates of the model over time.
-        loads: name of a body -> external wrench, see `solve_trial`.
+        loads: body -> external wrench, see `solve_trial`.
     """
     model, kinematics = leg.model, Kinematics(leg.model)
     names = leg_muscles(leg) if sharing.muscles is None else sharing.muscles
@@ -289,7 +287,7 @@ def _bones(
 def _strength(
     kinematics: Kinematics, motion: CoordinateMotion, sharing: Sharing, pulls: Pulls
 ) -> tuple[Array, Array]:
-    """Return active forces at full activation and passive forces (f, m), N."""
+    """Return active and passive forces at full activation (f, m), N."""
     model = kinematics.model
     muscles = [model.muscles[name] for name in pulls.names]
     if sharing.law == "isometric":

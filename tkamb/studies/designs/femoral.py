@@ -57,12 +57,11 @@ class Cam:
 
 
 def joined(cam: Cam, box_half: float, vertices: Array, faces: Ids) -> tuple[Array, Ids]:
-    """Return the closed triangulation of a femoral component with its cam.
+    """Return a femoral component with its cam, closed.
 
     Args:
         box_half: half the width of the box, mm. Its walls are the planes z = ±box_half.
-        vertices: vertices of the component without the cam, mm, shape (n, 3).
-        faces: faces of the component without the cam, shape (k, 3).
+        vertices: vertices of the component without the cam, mm, (n, 3).
     """
     cam_direction = np.arctan2(-cam.centre_ap, -cam.centre_si)
     angle = np.degrees(np.arctan2(-vertices[:, 0], -vertices[:, 1]) - cam_direction)
@@ -83,7 +82,7 @@ def joined(cam: Cam, box_half: float, vertices: Array, faces: Ids) -> tuple[Arra
 
 
 def _outline(vertices: Array, window: Ids) -> Ids:
-    """Return the edge vertices of an area of a wall, sorted by angle about their mean."""
+    """Return a window's edge vertices, sorted by angle about their mean."""
     edges = window[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     pairs, count = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)
     rim = pairs[count == 1]
@@ -106,7 +105,7 @@ def _angles(vertices: Array, loop: Ids) -> Array:
 
 
 def _between(vertices: Array, first: Ids, second: Ids) -> Ids:
-    """Return the triangles between two loops that are sorted by angle. `second` has greater z."""
+    """Return triangles between two loops sorted by angle; `second` has greater z."""
     ahead = [np.append(_angles(vertices, loop)[1:], np.inf) for loop in (first, second)]
     i = j = 0
     triangles = []
@@ -132,13 +131,13 @@ def normal(phi: ArrayLike) -> Array:
 
 
 class SagittalProfile:
-    """A chain of circular arcs that meet with a common tangent.
+    """Circular arcs that meet with a common tangent.
 
     The centres of the arcs are c_{i+1} = c_i + (R_i - R_{i+1}) n(phi_i), where phi_i is the angle
     of the normal at which arcs i and i + 1 meet.
 
     Args:
-        arcs: rows (from deg, to deg, radius mm); each arc starts at the end of the preceding one.
+        arcs: rows (from deg, to deg, radius mm), one after the other.
         origin: anterior and superior position of the first arc's centre, mm.
     """
 
@@ -204,7 +203,7 @@ ROW_SPACING = (
     (35.0, 135.0, 0.56),
     (135.0, 150.0, 0.9),
 )
-"""Rows (from deg, to deg, spacing mm) of the mesh. It is fine where the insert touches."""
+"""Rows (from deg, to deg, spacing mm) of the mesh, fine where the insert touches."""
 
 
 @dataclass(frozen=True)
@@ -213,15 +212,13 @@ class FemoralComponent:
 
     Args:
         medial_arcs: arcs (from, to, radius) of the medial J-curve.
-        lateral_arcs: arcs of the lateral J-curve.
-        origin_phi: angle of a normal. The centre of the medial arc with this normal is the origin.
+        origin_phi: angle of the normal of the medial arc whose centre is the origin.
         ridge_half_at_flange_top: ML distance of the ridges at the top of the flange.
         groove_radius: radius of the trochlear groove, which is tangent to both condyles.
         width_half_at_flange_top: half the outer width at the top of the flange.
         taper_phi: angles of the normals between which ridges and outer edges widen.
         notch_phi: angles of the normals at which the notch (or box) begins and has its full width.
         blend_half: ML distance from the middle within which unequal J-curves blend.
-        cam: cam of a posterior-stabilised component; None: no cam.
     """
 
     medial_arcs: Arcs
@@ -269,19 +266,19 @@ class FemoralComponent:
         return np.asarray(top + (self.width_half - top) * self._taper(phi))
 
     def notch(self, phi: ArrayLike) -> Array:
-        """Return the ML distance of the notch's edge from the middle. The front is elliptic."""
+        """Return the ML distance of the notch's edge from the middle; its front is elliptic."""
         start, end = np.radians(self.notch_phi)
         s = np.clip((np.asarray(phi) - start) / (end - start), 0.0, 1.0)
         s = np.where(s < 1e-9, 0.0, s)
         return np.asarray(self.notch_half * np.sqrt(s * (2.0 - s)))
 
     def groove_depth(self, phi: ArrayLike) -> Array:
-        """Return the depth of the groove below the ridges. Groove and condyle arcs are tangent."""
+        """Return the groove's depth below the ridges; groove and condyle arcs are tangent."""
         radii = self.groove_radius + self.coronal_radius
         return np.asarray(radii - np.sqrt(radii**2 - self.ridge(phi) ** 2))
 
     def depth(self, phi: ArrayLike, z: ArrayLike) -> Array:
-        """Return the depth of the articular surface below the J-curve of the ridges."""
+        """Return the depth of the surface below the J-curve of the ridges."""
         u, apex, coronal = np.abs(z), self.ridge(phi), self.coronal_radius
         tangent = apex * self.groove_radius / (self.groove_radius + coronal)
         across = np.clip(u - apex, -coronal, coronal)
@@ -296,17 +293,17 @@ class FemoralComponent:
         return np.asarray(np.where(u < tangent, concave, convex) + drop + outer)
 
     def surface(self, phi: ArrayLike, z: ArrayLike) -> Array:
-        """Return points (..., 3) of the articular surface in the femoral frame, mm."""
+        """Return points (..., 3), femoral frame, mm."""
         phi, z = np.broadcast_arrays(phi, z)
         return self._below(phi, z, self.depth(phi, z))
 
     def groove(self, phi: ArrayLike) -> Array:
-        """Return points (..., 2) of the deepest line of the groove in the sagittal plane, mm."""
+        """Return points (..., 2) of the groove's deepest line, sagittal plane, mm."""
         phi = np.asarray(phi, float)
         return np.asarray(self._below(phi, np.zeros_like(phi), self.groove_depth(phi))[..., :2])
 
     def mesh(self) -> tuple[Array, NDArray[np.int64]]:
-        """Return a closed triangulation in the femoral frame: vertices, mm, and faces."""
+        """Return a closed triangulation, femoral frame: vertices, mm, and faces."""
         rows = self._rows()
         half = self._columns(rows)
         z = np.concatenate([-half[:, ::-1], half], axis=1)
@@ -321,13 +318,13 @@ class FemoralComponent:
         )
 
     def mesh_with_cam(self) -> tuple[Array, NDArray[np.int64]]:
-        """Return the closed triangulation of `mesh` with the cam across its box."""
+        """Return `mesh` with the cam across its box."""
         if self.cam is None:
             raise InputError("the femoral component has no cam", "[cam]", "give its dimensions")
         return joined(self.cam, self.notch_half, *self.mesh())
 
     def _below(self, phi: Array, z: Array, depth: Array) -> Array:
-        """Return points (..., 3) at a depth below the J-curve, blended between condyles at z."""
+        """Return points (..., 3) below the J-curve, blended between condyles at z."""
         place = self.profile.point(phi, depth)
         if self.lateral_profile is not self.profile:
             s = np.clip(0.5 + 0.5 * np.asarray(z) / self.blend_half, 0.0, 1.0)
@@ -341,13 +338,13 @@ class FemoralComponent:
         return self._below(phi, z, thickness)
 
     def _taper(self, phi: ArrayLike) -> Array:
-        """Return a smooth factor of phi, rad: 0 at the top of the flange, 1 behind the taper."""
+        """Return a smooth factor of phi, rad: 0 at the flange's top, 1 behind the taper."""
         start, end = np.radians(self.taper_phi)
         s = np.clip((np.asarray(phi) - start) / (end - start), 0.0, 1.0)
         return np.asarray(s * s * (3.0 - 2.0 * s))
 
     def _columns(self, phi: Array) -> Array:
-        """Return z (rows, columns) of the vertices of the lateral half, from the notch outwards."""
+        """Return z (rows, columns) of the lateral half's vertices, from the notch outwards."""
         apex, outer, inner = (edge(phi)[:, None] for edge in (self.ridge, self.width, self.notch))
         fillet = outer - self.edge_fillet
         near, far = apex - 9.0, apex + 0.8 * (fillet - apex)
@@ -363,7 +360,7 @@ class FemoralComponent:
         )
 
     def _rows(self) -> Array:
-        """Return phi of the rows of vertices, rad, dense at the insert and the notch's front."""
+        """Return phi of the rows, rad, dense at the insert and the notch's front."""
         start, end = np.radians(self.notch_phi)
         front = start + (end - start) * (1.0 - np.cos(np.radians(np.linspace(0.0, 30.0, 5))))
         rows = self.profile.nodes(ROW_SPACING)
@@ -372,6 +369,6 @@ class FemoralComponent:
 
 
 def rounded_edge(distance: ArrayLike, radius: ArrayLike) -> Array:
-    """Return how far a rounded edge lies below the surface, mm, at a distance from the edge, mm."""
+    """Return how far (mm) a rounded edge lies below the surface at a distance (mm) from it."""
     inside = np.clip(np.asarray(radius) - distance, 0.0, radius)
     return np.asarray(radius - np.sqrt(np.asarray(radius) ** 2 - inside**2))

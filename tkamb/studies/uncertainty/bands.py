@@ -23,14 +23,15 @@ from tkamb.run.status import out_of_equilibrium
 
 ENDS = ("p05", "p95")
 TOTALS_N = ("force_si_N", "force_total_N")
-"""Columns of results.csv with the total force. The first one present is used."""
+"""Columns with the total force, of which the first one present is used."""
 PATELLOFEMORAL = ("patellofemoral_tangential_N", "patellofemoral_N")
-"""Columns of results.csv with the force across the button's normal, and along it."""
+"""Columns with the force across the button's normal, and along it."""
 ROUND_OFF = 1e-9
 """Ratio of standard deviation to magnitude below which a result counts as constant."""
 SAMPLES_PER_INPUT = 6
-"""Smallest number of samples per input for a joint regression. With fewer samples the shares are
-mostly chance."""
+"""Smallest number of samples per input for a joint regression; with fewer the shares are mostly
+chance.
+"""
 NUMBER = re.compile(r"[-−]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 MOST_CAUSES = 3
 
@@ -51,7 +52,7 @@ def percentiles(values: Array, failed: np.ndarray | None = None) -> dict[str, Ar
     than `MAX_FAILED_SHARE` of the samples failed.
 
     Args:
-        values: values of the samples, shape (n, ...); NaN for a missing value.
+        values: values of the samples, (n, ...); NaN for a missing value.
         failed: whether each sample failed, with the shape of `values`; None: no failures.
 
     Reference: Hyndman & Fan, Am Stat 50:361 (1996), doi:10.1080/00031305.1996.10473566, their
@@ -71,12 +72,12 @@ def percentiles(values: Array, failed: np.ndarray | None = None) -> dict[str, Ar
 
 
 def peak_band(nominal: Array, values: Array, failed: np.ndarray) -> dict[str, Any] | None:
-    """Return the band of a result at the frame where its nominal value is largest.
+    """Return the band of a result at the frame of its largest nominal value.
 
     Args:
-        nominal: nominal values of the result, shape (f,).
-        values: values of the samples, shape (n, f); NaN for a missing value.
-        failed: whether each frame of each sample failed, shape (n, f).
+        nominal: nominal values of the result, (f,).
+        values: values of the samples, (n, f); NaN for a missing value.
+        failed: whether each frame of each sample failed, (n, f).
 
     Returns:
         Frame, nominal value, number of samples and of failed samples, median, p05 and p95 (None:
@@ -120,13 +121,12 @@ def _peak_words(peak: Mapping[str, Any]) -> str:
 def band_columns(
     time: Array, names: Sequence[str], values: Array, failed: np.ndarray
 ) -> dict[str, Array]:
-    """Return the columns of bands.csv, with one entry per frame.
+    """Return the columns of bands.csv, (f,), for the m `names`.
 
     Args:
-        time: times of the frames, s, shape (f,).
-        names: names of m columns of results.csv.
-        values: values of the samples, shape (n, m, f).
-        failed: whether each frame of each sample failed, shape (n, f).
+        time: s, (f,).
+        values: values of the samples, (n, m, f).
+        failed: whether each frame of each sample failed, (n, f).
     """
     columns = {"time_s": time, "failed_share": failed.mean(axis=0)}
     solved = np.maximum((~failed).sum(axis=0), 1)
@@ -146,8 +146,7 @@ def unbalanced_patella(
     """Return how often a recorded patella is not in equilibrium with its lines, by `status`.
 
     Args:
-        names: names of m columns of results.csv.
-        values: values of the samples, shape (n, m, f).
+        values: values of the samples, (n, m, f).
         body_weight: body weight, N.
 
     Returns:
@@ -173,12 +172,11 @@ def discrepancy_columns(
 ) -> dict[str, Array]:
     """Return the columns `<name>_discrepancy_p05` and `_p95`: the band of inputs and discrepancy.
 
-    There are no columns if the discrepancy of the run is unknown. Values are NaN where the force or
-    the total force has no band.
+    There are none if the run's discrepancy is unknown. Values are NaN where the force or the total
+    force has no band.
 
     Args:
-        names: names of m columns of results.csv.
-        values: values of the samples, shape (n, m, f).
+        values: values of the samples, (n, m, f).
         body_weight: body weight, N.
     """
     discrepancy = discrepancy_of(summary)
@@ -200,7 +198,7 @@ def discrepancy_columns(
 
 
 def causes(problems: np.ndarray) -> dict[str, float]:
-    """Return cause -> its share of the failed frames, for the most frequent causes.
+    """Return cause -> its share of the failed frames, for the most frequent ones.
 
     Args:
         problems: reason why each frame failed, "" if it did not. Its last clause is the cause,
@@ -214,10 +212,7 @@ def causes(problems: np.ndarray) -> dict[str, float]:
 def measured_inside(
     columns: Mapping[str, Any], bands: Mapping[str, Array], compared: Mapping[str, Any]
 ) -> dict[str, dict[str, Any]]:
-    """Return the share of frames in which each measured force lies within its band.
-
-    Args:
-        compared: force -> its comparison, as in `measured` of the summary.
+    """Return the share of frames with the measured force inside its band.
 
     Returns:
         Force -> number of frames with force and band, share of them inside the band of inputs (NaN
@@ -239,13 +234,11 @@ def measured_inside(
 
 @dataclass(frozen=True)
 class Influence:
-    """Influence of one input on one result.
-
-    Args:
-        name: name of the input, or "rest" for variance that no function of one input explains.
-        share: share of the variance of the result, summed over all frames.
-        change: linear change of the result per standard deviation of the input, at the frame of the
-            largest median of the result; NaN for "rest".
+    """Args:
+    name: of the input, or "rest" for variance that no function of one input explains.
+    share: in the variance of the result, summed over all frames.
+    change: of the result per standard deviation of the input, linear, at the frame of the
+        largest median; NaN for "rest".
     """
 
     result: str
@@ -259,9 +252,9 @@ def influences(
 ) -> list[Influence]:
     """Return the tornado table: the share of each input in the variance of each result.
 
-    The inputs of a result are sorted by their share. The table comes from a least-squares fit of
-    y = a + sum_i (b_i x_i + c_i x_i²) + e at each frame, where x_i are the errors of the inputs in
-    standard deviations. The squares describe results that increase for errors of both signs.
+    Inputs are sorted by their share. The table comes from a least-squares fit of y = a + sum_i (b_i
+    x_i + c_i x_i²) + e at each frame, where x_i are the errors of the inputs in standard
+    deviations. The squares describe results that increase for errors of both signs.
 
     The part of an input in var(y) is cov(b_i x_i + c_i x_i², y). For independent inputs it is
     b_i² var(x_i) + c_i² var(x_i²). For correlated inputs it includes their joint effect and may be
@@ -270,12 +263,12 @@ def influences(
     from round-off has no rows.
 
     With fewer than `SAMPLES_PER_INPUT` samples per input, each input is regressed alone. In n
-    samples chance explains 2/(n - 3) of the unexplained variance. This is subtracted from the part.
+    samples chance explains 2/(n - 3) of the unexplained variance, which is subtracted.
 
     Args:
         results: names of the m results.
-        values: values of the samples, shape (n, m, f); NaN for a missing value.
-        errors: errors of the inputs in standard deviations, shape (n, f, d).
+        values: values of the samples, (n, m, f); NaN for a missing value.
+        errors: errors of the inputs in standard deviations, (n, f, d).
 
     Reference: Li et al., J Phys Chem A 114:6022 (2010), doi:10.1021/jp9096919.
     """
@@ -319,7 +312,7 @@ def _regression(y: Array, errors: Array) -> tuple[Array, Array, float] | None:
 
 
 def _one_by_one(y: Array, x: Array) -> tuple[Array, Array, float]:
-    """Return the result of `_regression` from a separate regression on each input."""
+    """Return `_regression` with each input alone."""
     variance, slopes, parts = float(y.var()), np.zeros(x.shape[1]), np.zeros(x.shape[1])
     for i, column in enumerate(x.T):
         terms: Any = np.column_stack([column, column**2])

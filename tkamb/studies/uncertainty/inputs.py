@@ -1,7 +1,6 @@
 """The varied inputs of a case, their standard deviations, and samples of their errors.
 
-Sample n does not depend on the number of samples. A larger number therefore includes the samples of
-a smaller one.
+Sample n does not depend on the number of samples, so a larger number includes a smaller one.
 
 Correlated inputs ([[uncertainty.correlation]]) are z = L x, with x independent standard normal and
 L L^T the correlation matrix (Cholesky). This is a Gaussian copula, because every input is a
@@ -35,7 +34,7 @@ PATELLAR_LIGAMENT = "patellar_ligament"
 MARKED = ("shank", "thigh")
 """Segments with varied marker positions."""
 LINE_ENDS = ("origin", "insertion")
-"""Ends of the line of a muscle that pulls the patella."""
+"""Ends of a muscle's line that pulls the patella."""
 GROUP_ENDS = ("shank", "thigh")
 """Segments to which the lines of a muscle group are attached."""
 ACROSS_KNEE = ("thigh to shank", "thigh to foot")
@@ -47,7 +46,7 @@ class VariedInput:
     """One input that varies.
 
     Args:
-        deviation: standard deviation of the input, in `unit`.
+        deviation: standard deviation, in `unit`.
         unit: unit of the deviation: "mm", "deg", "relative", or "1" for a number without unit.
     """
 
@@ -57,9 +56,9 @@ class VariedInput:
 
 
 def varied_inputs(case: Case) -> tuple[VariedInput, ...]:
-    """Return the inputs of a case that have a standard deviation above 0.
+    """Return the inputs with a standard deviation above 0, poses first.
 
-    Pose coordinates come first, in the order of `KNEE_COORDINATES`.
+    Poses are in the order of `KNEE_COORDINATES`.
     """
     inputs = tuple(varied for varied in _all_inputs(case) if varied.deviation > 0)
     if not inputs:
@@ -70,7 +69,7 @@ def varied_inputs(case: Case) -> tuple[VariedInput, ...]:
 
 
 def held_inputs(case: Case) -> tuple[str, ...]:
-    """Return the names of the inputs with standard deviation 0, as "dome" for "dome.ap"."""
+    """Return the inputs with standard deviation 0, as "dome" for "dome.ap"."""
     constants = [constant.name for constant in _all_inputs(case) if constant.deviation == 0]
     names = (f"{name.partition('.')[0]}{'_angles' * ('.about_' in name)}" for name in constants)
     return tuple(dict.fromkeys(names))
@@ -88,13 +87,13 @@ def _all_inputs(case: Case) -> list[VariedInput]:
 
 
 def uncertainty_of(case: Case) -> UncertaintyTable:
-    """Return the table [uncertainty] of the scene, completed with the default deviations."""
+    """Return [uncertainty] with the default deviations."""
     table = case.scene.uncertainty or UncertaintyTable()
     return table.completed(from_markers=case.scene.motion.markers is not None)
 
 
 def pose_names(inputs: tuple[VariedInput, ...]) -> list[str]:
-    """Return the names of the inputs that are knee coordinates."""
+    """Return the inputs that are knee coordinates."""
     return [varied.name for varied in inputs if varied.name in KNEE_COORDINATES]
 
 
@@ -210,8 +209,8 @@ class Draw:
     """The errors of the inputs in one sample.
 
     Args:
-        normal: standard normal value of each input, shape (d,).
-        noise: standard normal value of each of the p pose inputs at each frame, shape (f, p).
+        normal: standard normal value of each input, (d,).
+        noise: standard normal value of each of the p pose inputs at each frame, (f, p).
         constant_share: share of the variance of a pose error that is constant over the frames.
     """
 
@@ -221,7 +220,7 @@ class Draw:
     constant_share: float
 
     def standardised(self) -> Array:
-        """Return the errors of the inputs at each frame, in standard deviations, shape (f, d)."""
+        """Return the errors at each frame, in standard deviations, (f, d)."""
         values = np.tile(self.normal, (len(self.noise), 1))
         poses = [i for i, varied in enumerate(self.inputs) if varied.name in KNEE_COORDINATES]
         share = self.constant_share
@@ -230,14 +229,14 @@ class Draw:
         return values
 
     def error(self, name: str) -> float:
-        """Return the error of an input in SI units; 0 if it does not vary. Not for poses."""
+        """Return the error in SI units; 0 if it does not vary. Not for poses."""
         for varied, value in zip(self.inputs, self.normal, strict=True):
             if varied.name == name:
                 return float(value) * varied.deviation * UNITS.get(varied.unit, 1.0)
         return 0.0
 
     def factor(self, name: str) -> float:
-        """Return a log-normal factor of mean 1 with the relative deviation of the input."""
+        """Return a log-normal factor of mean 1 with the input's relative deviation."""
         for varied, value in zip(self.inputs, self.normal, strict=True):
             if varied.name == name:
                 log_variance = np.log1p(varied.deviation**2)
@@ -245,11 +244,11 @@ class Draw:
         return 1.0
 
     def place(self, name: str) -> Array:
-        """Return the error of a position, m, shape (3,): ap, si, ml."""
+        """Return the error of a position, m, (3,): ap, si, ml."""
         return np.array([self.error(f"{name}.{axis}") for axis in AXES])
 
     def turn(self, name: str) -> Array:
-        """Return the error of an orientation as a rotation vector, rad, shape (3,): ap, si, ml."""
+        """Return the error of an orientation, a rotation vector, rad, (3,): ap, si, ml."""
         return np.array([self.error(f"{name}.about_{axis}") for axis in AXES])
 
 
@@ -300,22 +299,21 @@ def _cholesky(matrix: Array) -> Array:
 
 Method = Literal["lhs", "sobol"]
 BLOCK = 64
-"""Number of samples in a Latin hypercube. Further samples form further hypercubes."""
+"""Samples of a Latin hypercube; further samples form further hypercubes."""
 SMALLEST_TAIL = 1e-9
-"""Smallest probability that is mapped to a normal quantile. Sobol' points may be 0, and the
-quantile of 0 is infinite."""
+"""Smallest probability that is mapped to a normal quantile: Sobol' points may be 0."""
 NOISE = 1
-"""Number in the seed of the noise. The seeds of the hypercubes have 0 in its place."""
+"""Number in the noise's seed, where the hypercubes have 0."""
 
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """Point of a sample in the space of the inputs.
+    """Point of a sample.
 
     Args:
-        normal: standard normal value of each input, shape (d,).
-        noise_of: number of the sample that defines the noise of each input over the frames, length
-            d; None: no noise.
+        normal: standard normal value of each input, (d,).
+        noise_of: sample that defines the noise of each input over the frames, length d; None: no
+            noise.
     """
 
     normal: Array
@@ -323,19 +321,19 @@ class Point:
 
     @classmethod
     def of(cls, number: int, normal: Array) -> "Point":
-        """Return the point of a sample that defines the noise of all inputs."""
+        """Return the point of a sample with noise of its own."""
         return cls(normal, (number,) * len(normal))
 
 
 def crossed_points(first: Array, second: Array) -> list[Point]:
     """Return the points of Saltelli's design: A, B, and A with one column from B for each input.
 
-    The noise of an input is taken from the same matrix as its column. The points are sorted: n of
-    A, n of B, then n for each input.
+    The noise of an input is taken from the same matrix as its column. They are sorted: n of A, n of
+    B, then n for each input.
 
     Args:
-        first: matrix A of standard normal values, shape (n, d).
-        second: matrix B of standard normal values, shape (n, d).
+        first: matrix A of standard normal values, (n, d).
+        second: matrix B of standard normal values, (n, d).
 
     Reference: Saltelli et al., Comput Phys Commun 181:259 (2010),
     doi:10.1016/j.cpc.2009.09.018.
@@ -360,13 +358,8 @@ def one_at_a_time(dimensions: int) -> list[Point]:
 def normal_samples(method: str, count: int, dimensions: int, seed: int) -> Array:
     """Return samples (count, dimensions) of independent standard normal inputs.
 
-    "lhs" makes Latin hypercubes of `BLOCK` samples, "sobol" one scrambled Sobol' sequence. The
-    normal quantile function maps these uniform samples to normal ones.
-
-    Args:
-        method: sampling method, "lhs" or "sobol".
-        count: number of samples, at least 1.
-        seed: seed of the random numbers.
+    "lhs" makes Latin hypercubes of `BLOCK` samples, "sobol" one scrambled Sobol' sequence, which
+    the normal quantile function maps.
     """
     if count < 1:
         raise InputError(f"{count} is not a number of samples", "samples", "give at least 1")
@@ -395,9 +388,8 @@ def noise_of_point(
     """Return the noise (f, p) of some inputs at a point.
 
     Args:
-        time: increasing times of the frames, s, shape (f,).
+        time: increasing times of the frames, s, (f,).
         correlation_time: correlation time of the noise, s.
-        seed: seed of the random numbers.
     """
     result = np.zeros((len(time), len(columns)))
     for number in dict.fromkeys(point.noise_of or ()):
@@ -415,9 +407,8 @@ def noise(number: int, time: Array, dimensions: int, correlation_time: float, se
     The noise is stationary for any time steps.
 
     Args:
-        time: increasing times of the frames, s, shape (f,).
+        time: increasing times of the frames, s, (f,).
         correlation_time: correlation time tau, s; 0: white noise.
-        seed: seed of the random numbers.
     """
     draws = np.random.default_rng([seed, NOISE, number]).standard_normal((len(time), dimensions))
     if correlation_time == 0.0:

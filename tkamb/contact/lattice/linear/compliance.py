@@ -34,11 +34,11 @@ class ResponseSettings:
     """Products of columns of Z, for the compliance."""
 
     gathered_columns: int = 512
-    """Columns that are copied for BLAS at a time. Their 3 MB fit into a processor's
-    cache."""
+    """Columns that are copied for BLAS at a time; their 3 MB fit into a processor's cache."""
     few_columns: int = 12
-    """Largest number of columns that are multiplied without BLAS. The copy for BLAS
-    costs more time than it saves for so few columns."""
+    """Largest number of columns that are multiplied without BLAS. The copy costs more time than it
+    saves for so few.
+    """
 
 
 RESPONSE = ResponseSettings()
@@ -49,12 +49,12 @@ class HalfResponse:
     """Z = L⁻¹ E of q unknowns.
 
     Args:
-        rank: column of Z of each unknown, shape (q,); -1 if the unknown is held.
-        blocks: nonzero blocks of Z, shape (b, 4): first row, end of the rows, first column, end
-            of the columns. An end is one past the last. Rows are in elimination order, and no two
-            blocks share a row.
-        values: the columns of the blocks, one after the other, float64 or float32, shape (v,).
-        places: position in `values` of each column of each block, shape (w,).
+        rank: column of Z of each unknown, (q,); -1 if the unknown is held.
+        blocks: nonzero blocks of Z, (b, 4): first row, end of the rows, first column, end of the
+            columns. An end is one past the last. Rows are in elimination order, and no two blocks
+            share a row.
+        values: the columns of the blocks, one after the other, float64 or float32, (v,).
+        places: position in `values` of each column of each block, (w,).
     """
 
     rank: Index
@@ -99,10 +99,10 @@ class HalfResponse:
         return HalfResponse(rank, blocks, self.values, places)
 
     def compliance(self, subset: Index | None = None) -> Array:
-        """Return the displacements (s, q), m/N, of a subset under unit forces on all q unknowns.
+        """Return the displacements (s, q), m/N, under unit forces on all q unknowns.
 
         Args:
-            subset: unknowns whose displacements are returned, shape (s,); all by default.
+            subset: unknowns whose displacements are returned, (s,); all by default.
         """
         rank = self.rank if subset is None else self.rank[subset]
         rows, free = np.unique(rank[rank >= 0]), self.rank >= 0
@@ -151,7 +151,7 @@ class HalfResponse:
 
     @cached_property
     def _middle(self) -> int:
-        """Number of leading blocks that hold half of the entries."""
+        """Leading blocks that hold half of the entries."""
         # Two threads get about the same work, which is rows times columns.
         sizes = (self.blocks[:, 1] - self.blocks[:, 0]) * (self.blocks[:, 3] - self.blocks[:, 2])
         return int(np.searchsorted(np.cumsum(sizes), sizes.sum() / 2))
@@ -168,7 +168,7 @@ def _add_columns(
     begin: int,
     end: int,
 ) -> None:
-    """Add factors times columns of the blocks [begin, end) to y, in the precision of `values`."""
+    """Add factors times columns [begin, end) to y, in the precision of `values`."""
     for block in range(begin, end):
         start, stop, first = blocks[block, 0], blocks[block, 1], blocks[block, 2]
         total = np.zeros(stop - start, values.dtype)
@@ -194,7 +194,7 @@ def _add_products(
     begin: int,
     end: int,
 ) -> None:
-    """Add the products of columns [begin, end) with y to `products`, in the type of `values`."""
+    """Add the products of columns [begin, end) with y, in the type of `values`."""
     for block in range(len(blocks)):
         first = blocks[block, 2]
         lower, upper = max(first, begin), min(blocks[block, 3], end)
@@ -210,13 +210,11 @@ def _add_products(
 
 @compiled
 def _of_columns(blocks: Index, edges: Index, places: Index, columns: Index) -> tuple[Index, Index]:
-    """Return the `blocks` and `places` of a response with a subset of the columns.
+    """Return the `blocks` and `places` of a response with some of its columns.
 
     Args:
-        blocks: see `HalfResponse`.
-        edges: index in `places` at which each block begins, shape (b + 1,).
-        places: see `HalfResponse`.
-        columns: numbers of the columns of the subset, increasing, shape (u,).
+        edges: index in `places` at which each block begins, (b + 1,).
+        columns: numbers of the columns of the subset, increasing, (u,).
     """
     firsts, lasts = np.searchsorted(columns, blocks[:, 2]), np.searchsorted(columns, blocks[:, 3])
     nonempty = np.flatnonzero(lasts > firsts)
@@ -256,7 +254,6 @@ def _products(values: Array, places: Index, few: Array) -> Array:
 
 @compiled
 def _subtract_columns(target: Array, columns: Index, values: Array) -> None:
-    """Subtract values (n, k) from columns (k,) of the target."""
     for i in range(len(values)):
         for j in range(len(columns)):
             target[i, columns[j]] -= values[i, j]
@@ -268,7 +265,7 @@ def unknowns_of(nodes: Index) -> Index:
 
 
 class HalfSolves:
-    """Computes Z = L⁻¹ E for some unknowns front by front, while the factor is computed.
+    """Computes Z = L⁻¹ E of some unknowns, front by front while the factor is computed.
 
     Only fronts on the paths to the root take time and memory. In single precision the error of
     compliances is 1e-6 of the largest.
@@ -276,8 +273,7 @@ class HalfSolves:
     Args:
         starts: first unknown of each front in elimination order, then the number of unknowns.
         parents: front above each front; -1 at a root.
-        unknowns: positions in elimination order, shape (q,); -1 if held.
-        precision: type of the numbers.
+        unknowns: positions in elimination order, (q,); -1 if held.
     """
 
     def __init__(
@@ -294,7 +290,7 @@ class HalfSolves:
         self._columns: list[NDArray[Any]] = []
 
     def add(self, member: int, front: Front) -> None:
-        """Add the columns of the next front, from its block before rounding."""
+        """Add the columns of the next front, before it is rounded."""
         first, last = self._spans[member]
         if last == first:
             return
@@ -313,12 +309,12 @@ class HalfSolves:
         self._columns.append(columns)
 
     def response(self) -> HalfResponse:
-        """Return the response, and release the columns that this object stores."""
+        """Return the response, and release its stored columns."""
         blocks = np.array(self._blocks, np.int64).reshape(-1, 4)
         return HalfResponse.of(self._rank, blocks, joined(self._columns, self._precision))
 
     def _right_side(self, member: int) -> NDArray[Any]:
-        """Return a front's current right-hand side (columns of its span, unknowns of the front)."""
+        """Return a front's right-hand side (columns of its span, unknowns of the front)."""
         if member not in self._waiting:
             first, last = self._spans[member]
             shape = (last - first, self._starts[member + 1] - self._starts[member])
@@ -326,7 +322,7 @@ class HalfSolves:
         return self._waiting[member]
 
     def _column_spans(self) -> list[tuple[int, int]]:
-        """Return for each front the columns [first, last) that are not zero in it."""
+        """Return for each front its nonzero columns [first, last)."""
         edges = np.searchsorted(self._rows, self._starts).tolist()
         spans = list(pairwise(edges))
         for member, parent in enumerate(self._parents):
@@ -338,7 +334,7 @@ class HalfSolves:
         return spans
 
     def _pass_up(self, member: int, boundary: Index, passed: NDArray[Any]) -> None:
-        """Subtract a front's products (columns, m) from the right-hand sides of fronts above it."""
+        """Subtract a front's products (columns, m) from the fronts above it."""
         above, at = self._parents[member], 0
         first, last = self._spans[member]
         while at < len(boundary):
@@ -356,11 +352,9 @@ class ComplianceSettings:
     """The stored compliance of candidate nodes."""
 
     max_nodes: int = 1500
-    """Largest number of nodes of the stored compliance. The matrix then takes 80
-    MB."""
+    """Nodes of the stored compliance; the matrix then takes 80 MB."""
     spare_nodes: int = 100
-    """Number of nodes that may be added before the arrays have to grow. Larger: more memory, fewer
-    copies."""
+    """Nodes that may be added before the arrays grow. Larger: more memory, fewer copies."""
 
 
 COMPLIANCE = ComplianceSettings()
@@ -372,9 +366,9 @@ class ContactResponse:
 
     Args:
         whole: response of a set of nodes that contains the candidates.
-        candidates: positions of the candidates in this set, shape (m,).
-        compliance: m/N, shape (3, m, 3, m): component and node of the displacement, then
-            component and node of the force.
+        candidates: positions of the candidates in this set, (m,).
+        compliance: m/N, (3, m, 3, m): component and node of the displacement, then component and
+            node of the force.
     """
 
     whole: HalfResponse
@@ -426,14 +420,14 @@ def by_component(matrix: Array) -> Array:
 
 @dataclass
 class ComplianceCache:
-    """The compliance of the contact nodes that were requested so far.
+    """The compliance of the contact nodes requested so far.
 
     Apart from rounding, results do not depend on which nodes are stored.
 
     Args:
         whole: response of all contact nodes.
-        nodes: stored contact nodes in the order in which they were added, shape (p,).
-        stored: compliance, m/N, shape (3, s, 3, s) with s >= p, see `ContactResponse`.
+        nodes: stored contact nodes in the order in which they were added, (p,).
+        stored: compliance, m/N, (3, s, 3, s) with s >= p, see `ContactResponse`.
     """
 
     whole: HalfResponse
@@ -452,9 +446,9 @@ class ComplianceCache:
         """Return the displacement (m, 3), m, of contact nodes under forces on contact nodes.
 
         Args:
-            nodes: positions of the displaced nodes, increasing, shape (m,).
-            loaded: positions of the loaded nodes, increasing, shape (k,).
-            force: N, shape (k, 3).
+            nodes: positions of the displaced nodes, increasing, (m,).
+            loaded: positions of the loaded nodes, increasing, (k,).
+            force: N, (k, 3).
         """
         with self._lock:
             places = self._places(np.concatenate([nodes, loaded]))
@@ -463,7 +457,7 @@ class ComplianceCache:
         return np.einsum("aibj,jb->ia", compliance, force)
 
     def _places(self, needed: Index) -> Index:
-        """Return the positions of nodes (m,) in `stored`. Missing nodes are computed and added."""
+        """Return the positions of nodes (m,) in `stored`; missing nodes are added."""
         place = np.full(len(self.whole.rank) // 3, -1)
         place[self.nodes] = np.arange(len(self.nodes))
         if (place[needed] < 0).any():
@@ -475,7 +469,6 @@ class ComplianceCache:
         return place[needed]
 
     def _store(self, nodes: Index) -> None:
-        """Compute the compliance of nodes that are not stored yet, and store it."""
         old, new = len(self.nodes), len(nodes)
         count = old + new
         if count > self.stored.shape[1]:
@@ -492,8 +485,5 @@ class ComplianceCache:
 
 
 def _entries(values: Array, index: Index, axis: int) -> Array:
-    """Return the entries at positions `index` along an axis.
-
-    All positions are in range. The mode "clip" lets numpy omit a buffer.
-    """
+    """All positions are in range, so that "clip" lets numpy omit a buffer."""
     return np.take(values, index, axis=axis, mode="clip")

@@ -48,18 +48,18 @@ class Dissection:
 
 
 def dissect(index: Index, joined: sparse.csr_matrix, leaf: int = 48) -> Dissection:
-    """Return the nested dissection of a lattice's nodes.
+    """Return the nested dissection of a lattice.
 
     Args:
-        index: lattice index (i, j, k) of each node, shape (n, 3).
-        joined: pattern of the joined nodes, shape (n, n).
+        index: lattice index (i, j, k) of each node, (n, 3).
+        joined: pattern of the joined nodes, (n, n).
         leaf: largest number of nodes of a part that is not cut.
     """
     own: list[Index] = []
     parent: list[int] = []
 
     def cut(part: Index) -> int:
-        """Append the members of a part; return the position of its topmost member."""
+        """Append the members of a part; return its topmost one."""
         halves = None if len(part) <= leaf else _halves(index, joined, part)
         if halves is None:
             own.append(_along_columns(index, part))
@@ -81,7 +81,7 @@ def dissect(index: Index, joined: sparse.csr_matrix, leaf: int = 48) -> Dissecti
 def _halves(
     index: Index, joined: sparse.csr_matrix, part: Index
 ) -> tuple[Index, Index, Index] | None:
-    """Return the nodes (low, high, separator), or None if no plane separates the part."""
+    """Return (low, high, separator), or None if no plane separates the part."""
     position = index[part]
     for axis in np.argsort(-np.ptp(position, axis=0), kind="stable"):
         plane = int(np.median(position[:, axis]))
@@ -104,7 +104,6 @@ def _halves(
 
 
 def _along_columns(index: Index, part: Index) -> Index:
-    """Return the part sorted column by column."""
     i, j, k = index[part].T
     return part[np.lexsort((j, k, i)) if np.ptp(i) >= np.ptp(k) else np.lexsort((j, i, k))]
 
@@ -115,9 +114,8 @@ class Front:
 
     Args:
         start: first own unknown in elimination order.
-        stop: one past the last own unknown.
-        boundary: later unknowns that the front is coupled with, increasing, shape (m,).
-        block: W = [L11⁻¹; L21 L11⁻¹], shape (k + m, k).
+        boundary: later unknowns that the front is coupled with, increasing, (m,).
+        block: W = [L11⁻¹; L21 L11⁻¹], (k + m, k).
     """
 
     start: int
@@ -129,11 +127,8 @@ class Front:
         """Return the rows of W, divided by their scales and without the zeros of L11⁻¹.
 
         Args:
-            coarse: whether rows are rounded to 16-bit integers. The error of an entry is then
-                1.5e-5 of the largest entry of its row. If not, the scales are 1.
-
-        Returns:
-            The rows, one after the other, and their scales.
+            coarse: whether rows are rounded to 16-bit integers, with an error of 1.5e-5 of the
+                largest entry of the row. If not, the scales are 1.
         """
         block, scale = self.block, np.ones(len(self.block), self.block.dtype)
         if coarse:
@@ -154,7 +149,6 @@ class Shares:
 
     Args:
         first: fronts of the first thread, increasing.
-        second: fronts of the second thread, increasing.
         above: fronts above both, increasing, for one thread.
     """
 
@@ -172,20 +166,19 @@ class Shares:
 class CholeskyFactor:
     """P A Pᵀ = L Lᵀ of a symmetric positive definite matrix.
 
-    W of a front has a row for each of its unknowns and each unknown of its boundary. The rows of
-    front i begin at row `starts[i] + edges[i]` of all rows.
+    W of a front has a row for each of its unknowns and of its boundary. The rows of front i begin
+    at row `starts[i] + edges[i]` of all rows.
 
     Args:
-        order: unknowns in elimination order, shape (n,).
-        starts: first unknown of each front in elimination order, children before parents, then
-            the number of unknowns, shape (f + 1,).
-        parents: front above each front, shape (f,); -1 at a root.
-        edges: position in `boundary` at which the boundary of each front begins, then the length
-            of `boundary`, shape (f + 1,).
-        boundary: later unknowns that the fronts are coupled with, increasing within a front,
-            shape (b,).
+        order: unknowns in elimination order, (n,).
+        starts: first unknown of each front, children before parents, then the number of unknowns,
+            (f + 1,).
+        parents: front above each front, (f,); -1 at a root.
+        edges: position in `boundary` at which each front's begins, then the length of `boundary`,
+            (f + 1,).
+        boundary: later unknowns that the fronts are coupled with, increasing within a front, (b,).
         values: rows of W without the zeros of L11⁻¹, each divided by its scale.
-        scale: scales of the rows, shape (n + b,). Products have the type of this array.
+        scale: scales of the rows, (n + b,). Products have the type of this array.
     """
 
     order: Index
@@ -285,7 +278,7 @@ class CholeskyFactor:
 
 
 def joined(parts: list[NDArray[Any]], dtype: DTypeLike) -> NDArray[Any]:
-    """Return the parts joined into one array; each part is freed after its copy."""
+    """Return the parts joined; each part is freed after its copy."""
     result = np.empty(sum(part.size for part in parts), dtype)
     at = len(result)
     while parts:
@@ -368,7 +361,6 @@ def _backward(
 
 @compiled
 def _copy(fronts: Index, starts: Index, source: Array, target: Array) -> None:
-    """Copy the unknowns of fronts from one vector to another."""
     for front in fronts:
         for i in range(starts[front], starts[front + 1]):
             target[i] = source[i]
@@ -376,7 +368,6 @@ def _copy(fronts: Index, starts: Index, source: Array, target: Array) -> None:
 
 @compiled
 def _add(fronts: Index, starts: Index, source: Array, target: Array) -> None:
-    """Add the unknowns of fronts in one vector to another."""
     for front in fronts:
         for i in range(starts[front], starts[front + 1]):
             target[i] += source[i]
@@ -384,11 +375,11 @@ def _add(fronts: Index, starts: Index, source: Array, target: Array) -> None:
 
 @compiled
 def _divided(fronts: Index, parents: Index, sizes: Index) -> Index:
-    """Return the thread (k,) of each front: 0, 1, or 2 for the fronts above both.
+    """Return the thread (k,) of each front: 0, 1, or 2 above both.
 
     Each trial assigns the subtrees, the largest first, to the thread with less work. Then the
-    largest subtree loses its top, which becomes a front above both. The fastest division is
-    returned. `fronts` is increasing, `sizes` is the work of every front.
+    largest subtree loses its top, which becomes a front above both. Return the fastest. `fronts` is
+    increasing, `sizes` is the work of every front.
     """
     count = len(fronts)
     place = np.full(len(parents), -1)
@@ -442,9 +433,9 @@ def fronts_of(
     """Yield the fronts of the Cholesky factor, children before parents.
 
     Args:
-        matrix: symmetric, positive definite on the unknowns that have a rank, shape (n, n).
-        rank: place of each unknown in elimination order, shape (n,); -1 if it is excluded.
-        starts: first place of each tree member, then the number of places, shape (f + 1,).
+        matrix: symmetric, positive definite on the unknowns that have a rank, (n, n).
+        rank: place of each unknown in elimination order, (n,); -1 if it is excluded.
+        starts: first place of each tree member, then the number of places, (f + 1,).
         parent: index of each member's parent; -1 for a root.
         precision: type of the yielded fronts, which are computed in float64.
 
@@ -464,10 +455,9 @@ def fronts_of(
 
 
 def _lower_columns(matrix: sparse.csr_matrix, rank: Index, count: int) -> sparse.csc_matrix:
-    """Return the lower half of a symmetric matrix (n, n) in elimination order, by columns.
+    """Return the lower half of a symmetric matrix (n, n) in elimination order.
 
-    The rows of a column are not sorted. `fronts_of` explains `rank`. `count` is the number of
-    unknowns with a rank.
+    Rows of a column are not sorted. `count` unknowns have a rank.
     """
     edges = np.zeros(count + 1, np.int64)
     _count_lower(matrix.indptr, matrix.indices, rank, edges)
@@ -479,7 +469,7 @@ def _lower_columns(matrix: sparse.csr_matrix, rank: Index, count: int) -> sparse
 
 @compiled
 def _count_lower(indptr: Index, indices: Index, rank: Index, counts: Index) -> None:
-    """Write the number of entries of each column j into counts[j + 1]."""
+    """Write the entries of each column j into counts[j + 1]."""
     for i in range(len(rank)):
         for at in range(indptr[i], indptr[i + 1]):
             if 0 <= rank[i] <= rank[indices[at]]:
@@ -496,9 +486,9 @@ def _fill_lower(
     rows: Index,
     values: Array,
 ) -> None:
-    """Write the rows and values of each column, from its position in `edges` on.
+    """Write each column from its position in `edges` on.
 
-    The matrix is symmetric, so that its row i is its column i.
+    The matrix is symmetric: its row i is its column i.
     """
     for i in range(len(rank)):
         if rank[i] >= 0:

@@ -37,7 +37,7 @@ class MemoryNeedSettings:
     """The estimate of the memory that a lattice needs."""
 
     unknowns_per_node: int = 3
-    """Unknowns of a node. By definition; held unknowns are counted too."""
+    """Held unknowns are counted, too."""
     cell_bytes: int = 20_000
     """Bytes for a cell during the assembly of the stiffness. Measured: 9 to 22 kB, which
     `safety_factor` covers."""
@@ -64,7 +64,6 @@ class TooLittleMemoryError(ComputationError):
 
     Args:
         need: memory for the next step, bytes.
-        available: available memory, bytes.
         likely: expected memory for the whole computation, bytes; 0: as much as `need`.
     """
 
@@ -76,7 +75,7 @@ class TooLittleMemoryError(ComputationError):
         super().__init__(what, "lattice", "take a coarser resolution")
 
     def advice(self, size: float) -> str:
-        """Return the advice in words: a cell size that fits, when `size` (m) does not."""
+        """Return a cell size that fits, in words, when `size` (m) does not."""
         ratio = self.likely / max(self.available, 1.0)
         least_size = size * ratio ** (1.0 / MEMORY_NEED.memory_exponent)
         if least_size > MEMORY_NEED.largest_cell_size:
@@ -88,14 +87,11 @@ class TooLittleMemoryError(ComputationError):
 
 
 def check_memory(need: float, likely: float = 0.0) -> None:
-    """Raise an error if the available memory is too small.
-
-    Args:
-        need: memory for the next step, bytes.
+    """Args:
         likely: expected memory for the whole computation, bytes; for the advice.
 
     Raises:
-        TooLittleMemoryError: the available memory is too small.
+        TooLittleMemoryError: it is not.
     """
     available = available_memory()
     if MEMORY_NEED.safety_factor * need > available:
@@ -105,7 +101,7 @@ def check_memory(need: float, likely: float = 0.0) -> None:
 
 
 def check_assembly_memory(cells: int) -> None:
-    """Raise an error if the memory is too small to assemble the stiffness of the cells.
+    """Raise unless the stiffness of the cells can be assembled.
 
     Raises:
         TooLittleMemoryError: the available memory is too small.
@@ -123,8 +119,8 @@ def factor_memory(
 
     Args:
         tree: dissection of n nodes.
-        joined: pattern of the joined nodes, shape (n, n).
-        touched: mask of the contact nodes, shape (n,).
+        joined: pattern of the joined nodes, (n, n).
+        touched: mask of the contact nodes, (n,).
         itemsize: bytes of a stored number. A computed number has 8 bytes.
     """
     rank = np.empty(joined.shape[0], np.int64)
@@ -174,9 +170,9 @@ class ElasticOperator:
     """K = L Lᵀ on the free unknowns, and L⁻¹ E of unit forces E on the contact nodes.
 
     Args:
-        free: mask of the free unknowns, shape (3n,).
+        free: mask of the free unknowns, (3n,).
         factor: factor of the free part of the stiffness matrix.
-        contact_nodes: nodes of the contact surface, shape (c,).
+        contact_nodes: nodes of the contact surface, (c,).
         half: L⁻¹ E of their 3c unit forces.
     """
 
@@ -192,7 +188,7 @@ class ElasticOperator:
         return self.nodal(y)
 
     def start(self, force: Array, fronts: Shares | None = None) -> Array:
-        """Return y = L⁻¹ f in elimination order, for nodal forces (n, 3).
+        """Return y = L⁻¹ f in elimination order, for nodal forces (n, 3), N.
 
         Args:
             force: nodal forces, N; zero except on the nodes of the fronts.
@@ -211,7 +207,7 @@ class ElasticOperator:
 
     @cached_property
     def _unknown(self) -> Index:
-        """Number of the unknown at each place of the elimination order."""
+        """The unknown at each place of the elimination order."""
         return np.flatnonzero(self.free)[self.factor.order]
 
     @cached_property
@@ -267,14 +263,13 @@ def fixed_unknowns(
 
     A fixed bearing holds all unknowns of the bottom nodes. A mobile bearing holds their y. It also
     holds x of the two end nodes along z (those nearest to x = 0) and z of the node nearest to the
-    middle. This prevents rigid motion and allows every strain. Each separate piece of the insert
-    is held in the same way.
+    middle, which prevents rigid motion and allows every strain. Each separate piece of the insert
+    is held so.
 
     Args:
-        nodes: m, shape (n, 3).
-        bottom: nodes in the flat bottom, shape (b,).
-        bearing: "fixed" or "mobile".
-        piece: number of each node's piece, shape (n,); None: there is one piece.
+        nodes: m, (n, 3).
+        bottom: nodes in the flat bottom, (b,).
+        piece: number of each node's piece, (n,); None: there is one piece.
         ends_held: whether x and z of both end nodes are held, as in Sharma (2008), section 4.5.4.
             Then the insert cannot widen. A pressure that should be uniform varies by up to 10 %.
     """
@@ -296,7 +291,7 @@ def fixed_unknowns(
 
 
 def _nearest(nodes: Array, subset: Index, z: float) -> int:
-    """Return the node of a subset that is nearest to z; among equals the nearest to x = 0."""
+    """Return the node nearest to z; among equals the nearest to x = 0."""
     distance = np.abs(nodes[subset, 2] - z)
     tied = subset[distance <= distance.min() + 1e-9 + 1e-6 * np.ptp(nodes[subset, 2])]
     return int(tied[np.argmin(np.abs(nodes[tied, 0]))])
@@ -313,17 +308,17 @@ def prepare_operator(
     """Factorise a stiffness matrix and compute the contact nodes' half response.
 
     Args:
-        stiffness: symmetric, positive definite on the free unknowns, shape (3n, 3n).
-        index: lattice index of each node, shape (n, 3).
-        fixed: mask of the held unknowns, shape (3n,).
-        contact_nodes: nodes of the contact surface, shape (c,).
+        stiffness: symmetric, positive definite on the free unknowns, (3n, 3n).
+        index: lattice index of each node, (n, 3).
+        fixed: mask of the held unknowns, (3n,).
+        contact_nodes: nodes of the contact surface, (c,).
         precision: type of the stored numbers and of the response. The factor is computed in
             float64.
         coarse: whether the factor is stored in 16-bit integers, in half the memory of single
             precision. The response is not.
 
     Raises:
-        TooLittleMemoryError: factor and response do not fit into the available memory.
+        TooLittleMemoryError: factor and response do not fit.
         ComputationError: the matrix is not positive definite.
     """
     free = ~fixed
@@ -371,21 +366,17 @@ def prepare_operator(
 
 
 def operator_error(operator: ElasticOperator, solid: Solid) -> float:
-    """Return the relative error of an operator, against the stiffness K of its solid.
+    """Return the relative error of an operator, against its solid's K, applied cell by cell.
 
-    K is applied cell by cell. The error is the largest of
+    The error is the largest of
 
         |K ũ - f| / |f|                f = K u of a random u, ũ = L⁻ᵀ L⁻¹ f
         |fᵀũ - ũᵀK ũ| / fᵀũ            f: unit forces down on every contact node
         |Z g - L⁻¹ E g| / |L⁻¹ E g|    g random on the contact nodes
 
-    The first tests rough displacements. Its rounding error does not depend on the condition of K
-    (float32: 1e-6, 16-bit integers: 5e-4). The second tests smooth displacements. The third
-    compares the stored response with the factor. The random vectors involve every stored number.
-
-    Args:
-        operator: operator to check.
-        solid: solid that the operator should belong to.
+    The first tests rough displacements; its rounding error does not depend on the condition of K
+    (float32: 1e-6, 16-bit integers: 5e-4). The second tests smooth ones, the third compares the
+    stored response with the factor. The random vectors involve every stored number.
     """
     generator = np.random.default_rng(TEST_VECTOR_SEED)
     nodes, shape = operator.contact_nodes, solid.nodes.shape
@@ -414,6 +405,6 @@ def _free_force(operator: ElasticOperator, solid: Solid, displacement: Array) ->
 
 
 def _ratio(part: float | np.floating, whole: float | np.floating) -> float:
-    """Return |part / whole|, or inf where it is not finite, so that it fails every test."""
+    """Return |part / whole|, or inf where it is not finite, to fail every test."""
     value = abs(float(part)) / max(abs(float(whole)), 1e-300)
     return value if np.isfinite(value) else float("inf")

@@ -39,10 +39,10 @@ MAX_LOW_SHARE = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """Heights of the node layers over the columns of the grid.
+    """Node layers over the columns of the grid.
 
     Args:
-        reference: height H of the reference layer, m, (nx, nz).
+        reference: height H, m, (nx, nz).
         layers: J, number of cells between the bottom and the reference layer.
         spacing: spacing of the layers above the reference layer and below the bottom, m.
     """
@@ -61,7 +61,7 @@ class Levels:
         return self.below + within + outside / self.spacing
 
     def heights(self) -> Array:
-        """Return the heights (nx, count, nz) of all grid nodes, m."""
+        """Return the heights (nx, count, nz), m."""
         j = np.arange(self.count)[None, :, None] - self.below
         within = np.clip(j, 0, self.layers) * self.reference[:, None, :] / self.layers
         outside = np.minimum(j, 0) + np.maximum(j - self.layers, 0)
@@ -88,8 +88,8 @@ def _reference_layers(top: Array, thinnest: float, thickest: float, spacing: flo
     """Return the number of layers that can follow the largest part of the top surface.
 
     They end in a step where the top is more than half a layer too low for them. The edge of a step
-    has cells on one side only and is too soft. So a number with steps in the dishes is excluded; on
-    higher parts they are allowed, because no condyle meets them.
+    has cells on one side only and is too soft, so steps are allowed only on parts higher than the
+    dishes, which no condyle meets.
     """
     candidates = np.arange(1, int(np.ceil(top.max() / thinnest)) + 1)
     stepped = np.array([np.mean(top < (n - 0.5) * thinnest) for n in candidates])
@@ -100,7 +100,7 @@ def _reference_layers(top: Array, thinnest: float, thickest: float, spacing: flo
 
 
 def _smooth_part(height: Array, across: Array) -> Array:
-    """Return the heights of the largest smooth patch of columns, and NaN elsewhere.
+    """Return the largest smooth patch of columns, and NaN elsewhere.
 
     Slopes between neighbours of a patch are at most `MAX_SLOPE`.
     """
@@ -209,15 +209,15 @@ class NodeField:
     thin: int
 
     def has_top(self, nodes: tuple[Index, ...]) -> Mask:
-        """Return whether the columns of nodes (i, j, k) have a top node already."""
+        """Return whether the columns of nodes have a top node already."""
         return np.logical_or.reduce(self.top, axis=1)[nodes[0], nodes[2]]
 
 
 @dataclass(frozen=True, eq=False)
 class Ends:
-    """The layers of the first and last nodes of intervals.
+    """Layers of the first and last nodes of intervals.
 
-    `single` marks intervals of one node. `held` marks intervals whose only node is not moved.
+    `single` marks intervals of one node, `held` those whose node is not moved.
     """
 
     first: Index
@@ -227,7 +227,7 @@ class Ends:
 
 
 def place_columns(surface: Surface, spacing: Array) -> NodeField:
-    """Return the grid over the surface's bounding box, with nodes placed along y."""
+    """Return the grid over the bounding box, with nodes placed along y."""
     x, z = (_grid_line(surface, axis, spacing[axis]) for axis in (0, 2))
     intervals = inside_intervals(surface, 1, z, x)
     i, k = intervals.second, intervals.first
@@ -245,7 +245,7 @@ def place_columns(surface: Surface, spacing: Array) -> NodeField:
 def interval_ends(low: Array, high: Array, count: int) -> Ends:
     """Return the end nodes of intervals [low, high] of a line.
 
-    Heights are in layers. T = high - low is the thickness, and n the number of nodes strictly
+    Heights are in layers; T = high - low is the thickness, and n the number of nodes strictly
     inside. The node nearest to each end is moved to that end, except:
 
         n = 0, T <= 1/2   one node, moved to the mean height
@@ -253,7 +253,7 @@ def interval_ends(low: Array, high: Array, count: int) -> Ends:
         n = 1, T > 1/2    if the node is nearest to both ends, it is moved to the nearer end, and
                           the next node outside is moved to the other end
 
-    `count` is the number of nodes of a line; the ends have the shape (m,).
+    A line has `count` nodes; the ends are (m,).
     """
     first = np.floor(low + 0.5 + COLUMN_TIE).astype(np.int64)
     last = np.ceil(high - 0.5 - COLUMN_TIE).astype(np.int64)
@@ -272,7 +272,7 @@ def interval_ends(low: Array, high: Array, count: int) -> Ends:
 
 
 def _grid_line(surface: Surface, axis: int, spacing: float) -> Array:
-    """Return equally spaced coordinates over the part, m; the ends lie on its sides."""
+    """Return equally spaced coordinates, m, whose ends lie on the part's sides."""
     lower, upper = surface.bounds[:, axis]
     line = np.linspace(lower, upper, round((upper - lower) / spacing) + 1)
     values = surface.vertices[:, axis]
@@ -304,7 +304,7 @@ def _empty_field(lines: tuple[Array, Array], spacing: Array, heights: Array) -> 
 def _without_narrow_gaps(
     intervals: Intervals, low: Array, high: Array
 ) -> tuple[Intervals, Array, Array, int]:
-    """Join neighbouring intervals of a line if their facing ends have the same node."""
+    """Join neighbouring intervals whose facing ends have the same node."""
     same = (np.diff(intervals.first) == 0) & (np.diff(intervals.second) == 0)
     joined = same & (np.floor(low[1:] + 0.5 + COLUMN_TIE) <= np.ceil(high[:-1] - 0.5 - COLUMN_TIE))
     begins = np.flatnonzero(np.append(True, ~joined))
@@ -346,7 +346,7 @@ def refired_inwards(
 ) -> Array:
     """Return the heights (n,), m, of nodes that are moved onto walls.
 
-    A vertical ray on a rough wall may miss the part. The target (n, 3), m, is then moved inside by
+    A vertical ray on a rough wall may miss: the target (n, 3), m, is then moved inside by
     `wall_inset` along `inward` (n, 2), x and z, in place, and the ray repeated.
     """
     height = refired(field, nodes, target, rays)
@@ -362,8 +362,8 @@ def refired_inwards(
 def refired(field: NodeField, nodes: Nodes, target: Array, rays: RayCaster) -> Array:
     """Return the heights (n,), m, of nodes after a move sideways to `target` (n, 3).
 
-    Ends of intervals stay on the surface, and other nodes keep their height. The result is NaN
-    where the height of the surface changes by more than `MAX_HEIGHT_CHANGE`.
+    Ends of intervals stay on the surface, other nodes keep their height. The result is NaN where
+    the height of the surface changes by more than `MAX_HEIGHT_CHANGE`.
     """
     height = field.points[..., 1][nodes]
     for end, facing in ((field.upper_end[nodes], 1.0), (field.lower_end[nodes], -1.0)):
