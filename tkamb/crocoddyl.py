@@ -11,11 +11,10 @@ By the implicit function theorem, with J0 and J1 of `pin.dIntegrate`,
 
     (I - h a_v - h² a_q J1) dv' = dv + h a_q J0 dq + h a_u du.
 
-`CondyleForces` and `CondylePressures` are residuals for costs on the contact. If the model is
-out of its range, or Newton's method does not converge, the next state is NaN: the solver then
-shortens its step. The models are Python objects: set `nthreads = 1` in a `ShootingProblem`:
-more threads were not tested. Crocoddyl must fit the installed Pinocchio
-(`tkamb.crocoddyl_pair`).
+`CondyleForces` and `CondylePressures` are residuals for costs on the contact. Out of the model's
+range, or without convergence of Newton's method, the next state is NaN, and the solver shortens its
+step. The models are Python objects: set `nthreads = 1` in a `ShootingProblem` (more threads were
+not tested). Crocoddyl must fit the installed Pinocchio (`tkamb.crocoddyl_pair`).
 
 Reference: Mastalli et al., Crocoddyl: an efficient and versatile framework for multi-contact
 optimal control, ICRA (2020), doi:10.1109/ICRA40945.2020.9196673.
@@ -330,11 +329,6 @@ class _CondyleResidual(crocoddyl.ResidualModelAbstract):
     """Residual of one value per condyle, medial and lateral, that depends on q alone.
 
     The values are NaN if the contact model is out of its range, and for a state that is not finite.
-
-    Args:
-        state: `crocoddyl.StateMultibody` of `knee.model`.
-        knee: a knee with a contact model.
-        nu: number of controls.
     """
 
     def __init__(self, state: Any, knee: Knee, nu: int) -> None:

@@ -1,7 +1,7 @@
 """Whether the installed Crocoddyl fits the installed Pinocchio.
 
-Crocoddyl is compiled against one version of Pinocchio and reads its memory. With another version
-its own residuals read wrong numbers, or the process ends. `checked` refuses such a pair.
+Crocoddyl is compiled against one version of Pinocchio and reads its memory: with another one its
+residuals read wrong numbers, or the process ends. `checked` refuses such a pair.
 """
 
 import subprocess

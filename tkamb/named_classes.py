@@ -60,7 +60,6 @@ class NamedClasses(Generic[Base]):
         return cls
 
     def _offers(self) -> dict[str, str]:
-        """Return name -> "module:Class" of all classes."""
         offers = dict(self.built_in)
         for point in installed(self.group, tuple(sys.path)):
             first = offers.setdefault(point.name, point.value)
@@ -77,7 +76,6 @@ def installed(group: str, path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
     """Return the entry points of a group, by name; the search of a long path takes 10 ms.
 
     Args:
-        group: group of entry points.
         path: folders of the packages, `sys.path`.
     """
     return tuple(sorted(entry_points(group=group), key=lambda point: point.name))

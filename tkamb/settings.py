@@ -1,8 +1,8 @@
 """Settings objects that differ from their defaults.
 
-A settings object is an instance of a frozen dataclass with a name that ends in `Settings`. It is
-defined at the top level of the module that uses it. Each field has a docstring with unit, meaning
-and origin. `tkamb settings` lists all of them (`tkamb.commands.settings`).
+A settings object is an instance of a frozen dataclass with a name that ends in `Settings`, at the
+top level of the module that uses it. Each field has a docstring with unit, meaning and origin.
+`tkamb settings` lists all of them (`tkamb.commands.settings`).
 """
 
 import sys
@@ -15,7 +15,7 @@ SUFFIX = "Settings"
 def changed_settings() -> dict[str, Any]:
     """Return name -> value of the settings that differ from their defaults in this process.
 
-    Only imported modules count, since no other module has computed anything.
+    Only imported modules count: no other has computed anything.
     """
     changed: dict[str, Any] = {}
     for module_name, module in sorted(sys.modules.items()):

@@ -32,7 +32,7 @@ STIFFNESS_TOLERANCE = 0.1
 
 
 class ConformanceError(TkambError):
-    """A contact model lacks a property of the contract. The message names the property."""
+    """A contact model lacks the property of the contract that the message names."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,6 @@ class ConformanceCase:
     """The bodies, pose, load and tolerances of the check.
 
     Args:
-        pair: the two bodies.
         pose: (4, 4) pose_femoral_in_insert; its y is ignored.
         load: N, compressive.
         tolerance: 1, relative tolerance of forces, approach and pressure.
@@ -205,10 +204,10 @@ def _check_integral(case: ConformanceCase, pressed: ContactResult) -> None:
 def _check_femoral_frame(
     model: ContactModel, case: ConformanceCase, pressed: ContactResult
 ) -> None:
-    """Check that the result does not depend on the frame of the femoral mesh.
+    """Check that the result does not depend on the femoral mesh's frame, here rotated about z so
+    that medial and lateral do not change.
 
-    The insert frame is fixed, so that this is equivalent to moving both bodies together. The other
-    frame is rotated about z, so that medial and lateral do not change.
+    With a fixed insert frame this is equivalent to moving both bodies.
     """
     other = knee_pose([3e-3, -5e-3, 0.5e-3, 0.0, 0.0, np.radians(25)])
     pair = ContactPair(

@@ -235,7 +235,7 @@ def add_no_cache(command: argparse.ArgumentParser) -> None:
 
 
 def without_cache(contact: str | None) -> dict[str, Any]:
-    """Return the option that turns off the cache of a contact model on disk."""
+    """Return the option that turns off a contact model's cache on disk."""
     from tkamb.contact.registry import contact_options
 
     if contact is None:

@@ -1,7 +1,7 @@
 """Options that several commands share, rules that refuse options without effect, and examples.
 
-An option that would be ignored is refused, because the user expects an effect. `RULES` has the
-rules by command. `tests/test_option_rules.py` checks that each option has an effect or a rule.
+An option that would be ignored is refused, because the user expects an effect; `RULES` has the
+rules by command, and `tests/test_option_rules.py` checks that each option has an effect or a rule.
 """
 
 import argparse
@@ -24,7 +24,6 @@ def option(
         names: names of the option, and a word for its value: "--out DIR". Without this word,
             `choices` and `action`, the option is a switch.
         kind: function from the text of the value to the value; None: text.
-        more: further arguments of `argparse`.
     """
     words = names.split()
     flags = [word for word in words if word.startswith("-")]
@@ -69,12 +68,12 @@ def add_preset(command: Any) -> None:
 
 
 def add_force(command: argparse.ArgumentParser) -> None:
-    """Add --force to a command whose --out is one file."""
+    """Add --force beside an --out of one file."""
     option(command, "--force", "--out may replace a file that tkamb did not write")
 
 
 def overrides_of(options: argparse.Namespace) -> dict[str, Any]:
-    """Return dotted scene key -> value, from the options of `add_scene_options`."""
+    """Return dotted scene key -> value."""
     overrides = dict(options.set)
     if options.contact:
         overrides["contact.model"] = options.contact
@@ -230,7 +229,7 @@ RULES: dict[str, tuple[Rule, ...]] = {
 def check_options(
     parser: argparse.ArgumentParser, arguments: Sequence[str], options: argparse.Namespace
 ) -> None:
-    """Raise if an option has no effect because of the other options."""
+    """Raise if an option has no effect beside the others."""
     command, leaf, remaining = command_of(parser, arguments)
     present = _option_names(leaf, remaining)
     for rule in RULES.get(command, ()):
@@ -252,7 +251,7 @@ def check_options(
 def command_of(
     parser: argparse.ArgumentParser, arguments: Sequence[str]
 ) -> tuple[str, argparse.ArgumentParser, Sequence[str]]:
-    """Return the name of the command, its parser, and the arguments after the name."""
+    """Return the command's name, its parser, and the arguments after it."""
     names, remaining = [], list(arguments)
     while verbs := _verbs(parser):
         index = next((k for k, word in enumerate(remaining) if word in verbs), None)
@@ -282,9 +281,8 @@ def _verbs(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser
 
 
 def _option_names(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> set[str]:
-    """Return the long names of the options in the arguments, also of abbreviated ones.
-
-    An optional positional argument is represented by its metavar.
+    """Return the long names of options, also of abbreviated ones, and of an optional positional
+    argument its metavar.
     """
     names = {
         name: next(o for o in action.option_strings if o.startswith("--"))
@@ -385,7 +383,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
 
 
 def add_examples(parser: argparse.ArgumentParser) -> None:
-    """Write the examples at the end of the help of each command of a parser."""
+    """Write the examples at the end of each command's help."""
     for command, leaf in leaf_parsers(parser):
         examples = EXAMPLES.get(command)
         if examples:

@@ -1,6 +1,6 @@
 """The settings of tkamb's algorithms (`tkamb settings`).
 
-`tkamb.settings` describes a settings object. This module finds those of the package.
+This module finds the settings objects that `tkamb.settings` describes.
 """
 
 import argparse
@@ -26,7 +26,6 @@ class Setting:
 
     Args:
         name: dotted name, such as "lattice_solver.force_tolerance".
-        default: default value.
         meaning: unit, meaning and origin.
         algorithm: first line of the docstring of the settings class.
     """
@@ -82,7 +81,7 @@ def _rows(module: str, name: str, text: str) -> Iterator[Setting]:
 
 
 def field_docstrings(tree: ast.Module, name: str) -> dict[str, str]:
-    """Return the docstring below each field of a class, by name of the field."""
+    """Return field -> docstring below it, of a class."""
     body = next((n.body for n in tree.body if isinstance(n, ast.ClassDef) and n.name == name), [])
     texts = {}
     for node, following in pairwise(body):

@@ -18,10 +18,11 @@ QUICK_FRAMES = 11
 LEAST_SHOWN = 0.01
 """1: smallest share of a variance that is printed."""
 TERMS = 2
-"""Number of regressors per input: its value and its square. By chance alone, a regressor explains
-a share 1/n of the variance of n samples."""
+"""Regressors per input: its value and its square, each of which explains by chance alone 1/n of the
+variance of n samples.
+"""
 NOTABLE_FAILED = 0.05
-"""1: share of failed samples in a frame. A larger share gives a warning."""
+"""1: share of failed samples in a frame above which there is a warning."""
 
 
 def add_uncertainty(commands: Any) -> None:

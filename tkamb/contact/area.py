@@ -77,7 +77,7 @@ def _share(
     gap: Array,
     material: Material,
 ) -> Array:
-    """Return the shares in contact (m, 2) of the two sides of each triangle that the edge cuts.
+    """Return the shares in contact (m, 2) of the two cut sides of each triangle.
 
     `inside` and `outside` (m, 2) are these sides' ends in contact and out of contact.
     """
@@ -154,7 +154,7 @@ def _area_above(points: Array, triangles: Index, square: Array, level: float) ->
 
 @compiled_as_written
 def _shape(points: Array, corners: Index, edges: Array, across: Array) -> float:
-    """Return a triangle's area; write its edges (3, 3), each opposite its corner, and `across`."""
+    """Return the area; write edges (3, 3), each opposite its corner, and `across`."""
     for i in range(3):
         for axis in range(3):
             edges[i, axis] = points[corners[(i + 2) % 3], axis] - points[corners[(i + 1) % 3], axis]
@@ -166,7 +166,7 @@ def _shape(points: Array, corners: Index, edges: Array, across: Array) -> float:
 
 @compiled_as_written
 def _share_above(values: Array, level: float) -> float:
-    """Return the share of a triangle above a level, from the corners' values (3,); sort them."""
+    """Return the share above a level, by the corners' values (3,); sort them."""
     values.sort()
     low, middle, high = values[0], values[1], values[2]
     if level >= high:

@@ -1,17 +1,18 @@
 """Cam and post as a separate contact pair: the same contact model, in a turned frame.
 
-A cam touches the post from behind. The post is therefore turned so that its posterior face faces
-up. In the insert frame (x anterior, y superior, z to the right) the turned axes are
+A cam touches the post from behind, so the post is turned with its posterior face up. In the insert
+frame (x anterior, y superior, z to the right) the turned axes are
 
     x' = y - y_m,    y' = x_f - x,    z' = z - z_m,
 
 where x_f is the flat front of the post (`tkamb.geometry.post.divide_insert`), and y_m and z_m are
 the middle of the post's bounding box. The front is the fixed bottom of the layer, and the post's
-depth its thickness. The post does not bend at its root. The pair is evaluated at a given pose.
+depth its thickness. The post does not bend at its root. The pair is evaluated at a given pose, with
+rotation R and translation t of pose_insert_in_turned.
 
-R and t are rotation and translation of pose_insert_in_turned. X = [[R, t x R], [0, R]] maps a small
-displacement of the femur (translation of its point at the origin, then rotation) into the turned
-frame. As power is the same in both, wrench and stiffness in the insert frame are
+X = [[R, t x R], [0, R]] maps a small displacement of the femur (translation of its point at the
+origin, then rotation) into the turned frame. As power is the same in both, wrench and stiffness in
+the insert frame are
 
     w = X^T w',    K = X^T K' X.
 """
@@ -45,8 +46,9 @@ SEARCH_MARGIN = 3 * MILLIMETRE
 
 
 TICKS, ZOOMS = 41, 3
-"""Number of rays along each edge of a search grid, and number of grids. Each grid is twenty times
-finer than the one before. On 16 mm the last one has a spacing of 1 µm."""
+"""Rays along each edge of a search grid, and grids, each twenty times finer than the one before. On
+16 mm the last one has a spacing of 1 µm.
+"""
 NO_LINE_CONTACT = ("hertz",)
 """Models that cannot compute contact along a line."""
 
@@ -61,7 +63,7 @@ class PostPair(ContactPair):
     def clearance(self, pose: Array) -> float:
         """Return the smallest gap (m) along y' of post and cam; NaN if no line along y' meets both.
 
-        Rays along y' on a grid over the post find it; two finer grids follow. A search over
+        Rays along y' on a grid over the post find it, then on two finer grids. A search over
         vertices would miss contact on the edges of long triangles. `pose` (4, 4) is
         pose_femoral_in_turned.
         """
@@ -82,7 +84,7 @@ class PostPair(ContactPair):
         return least
 
     def _apart(self, points: Array, pose: Array) -> Array:
-        """Return the gap (n,), m, along y' at places (n, 3); NaN where a ray misses a body."""
+        """Return the gap (n,), m, along y' at (n, 3); NaN where a ray misses a body."""
         far, back = float(np.abs(self.femoral.bounds).max()), inverse(pose)
         below = points + (pose[1, 3] - 2 * far) * UP
         up, _ = self.femoral.rays.first(transform(back, below), rotate(back, UP))
@@ -94,7 +96,7 @@ class PostPair(ContactPair):
 
 @dataclass(frozen=True, eq=False)
 class PostContact:
-    """Contact of cam and post at one pose, insert frame, SI. Without contact the force is zero.
+    """Contact of cam and post at one pose, insert frame, SI; without contact the force is zero.
 
     Args:
         load: wrench of the normal forces on the insert; None without contact.
@@ -200,7 +202,7 @@ class CamPost:
         return CondylesAndPost(condyles, self.probe())
 
     def seen(self, contact: ProbedContact) -> ProbedContact:
-        """Return the post's contact in the insert frame, from a contact in the turned frame."""
+        """Return the post's contact in the insert frame, from the turned frame."""
         load = contact.condyles.get("medial")
         post = None if load is None else self._in_insert(load)
         return replace(contact, condyles={}, post=post)
@@ -230,12 +232,12 @@ class PostProbe:
         self._cam_post, self._turned = cam_post, turned_probe
 
     def at(self, pose: Array) -> ProbedContact:
-        """Return the contact of the post at a pose_femoral_in_insert (4, 4)."""
+        """Return the post's contact at a pose_femoral_in_insert (4, 4)."""
         return self._cam_post.seen(self._turned.at(self._cam_post.in_turned @ pose))
 
 
 class CondylesAndPost:
-    """Evaluates condyles and post of one insert at neighbouring poses, as one contact."""
+    """Evaluates condyles and post as one contact."""
 
     def __init__(self, condyles: Any, post: PostProbe) -> None:
         self._condyles, self._post = condyles, post
@@ -245,7 +247,7 @@ class CondylesAndPost:
         return _together(self._condyles.at(pose), self._post.at(pose))
 
     def smoothed(self, pose: Array, contact: ProbedContact) -> ProbedContact:
-        """Return the contact with a smoothed stiffness of the condyles; the post's is unchanged."""
+        """Return the contact with the condyles' stiffness smoothed, the post's unchanged."""
         condyles = self._condyles.smoothed(pose, replace(contact, post=None))
         return _together(condyles, replace(contact, condyles={}))
 
@@ -262,17 +264,14 @@ def _together(condyles: ProbedContact, post: ProbedContact) -> ProbedContact:
 
 
 def twist_matrix(pose: Array) -> Array:
-    """Return X (6, 6), which transforms a twist (translation, then rotation) from frame A to B.
-
-    `pose` is pose_A_in_B (4, 4).
-    """
+    """Return X (6, 6), which transforms a twist from frame A to B, by pose_A_in_B (4, 4)."""
     turn, (x, y, z) = pose[:3, :3], pose[:3, 3]
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.block([[turn, cross @ turn], [np.zeros((3, 3)), turn]])
 
 
 def cam_of(femoral: Surface, split: float | None, reach: float) -> Surface:
-    """Return the cam: the triangles between the condyles, in the posterior half of the component.
+    """Return the cam: the triangles between the condyles in the posterior half.
 
     `split` and `reach`, the cam's largest distance from it, are along z (m), femoral frame.
     """

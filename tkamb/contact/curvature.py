@@ -10,11 +10,12 @@ from tkamb.geometry.rays import RayCaster
 
 @dataclass(frozen=True)
 class CurvatureSettings:
-    """Curvature of the two surfaces at a contact point, from a patch of rays."""
+    """Curvatures at a contact point, from a patch of rays."""
 
     samples: int = 21
-    """Number of rays along the diameter of a patch. About 350 rays for the six
-    coefficients of a quadric average out the facets of a mesh."""
+    """Rays along the diameter of a patch: about 350 for the six coefficients of a quadric average
+    out the facets.
+    """
     max_iterations: int = 12
     """Largest number of iterations for the contact point. Not studied."""
     position_tolerance: float = 1e-7
@@ -107,7 +108,7 @@ def _start_normal(insert: RayCaster, start: Array) -> Array:
 
 
 def _tangents(normal: Array) -> tuple[Array, Array]:
-    """Return two tangents; the first lies in the sagittal plane."""
+    """The first tangent lies in the sagittal plane."""
     first = np.cross(normal, [0.0, 0.0, 1.0])
     first /= np.linalg.norm(first)
     return first, np.cross(normal, first)
@@ -116,7 +117,7 @@ def _tangents(normal: Array) -> tuple[Array, Array]:
 def _fit(
     insert: RayCaster, femoral: RayCaster, pose: Array, point: Array, frame: Array, radius: float
 ) -> tuple[Array, Array] | None:
-    """Return quadric coefficients (6,) of the insert and of the femur over the tangent plane."""
+    """Return coefficients (6,) of insert and femur over the tangent plane."""
     ticks = np.linspace(-radius, radius, CURVATURE.samples)
     u, v = (grid.ravel() for grid in np.meshgrid(ticks, ticks))
     disc = u**2 + v**2 <= radius**2 * 1.0001
@@ -155,7 +156,7 @@ def _slope(quadric: Array, place: Array) -> Array:
 
 
 def _nearest_place(difference: Array, radius: float) -> Array | None:
-    """Return the place (2,), m, of a quadric's minimum, at most a radius away; None without one."""
+    """Return a quadric's minimum (2,), m, at most a radius away, or None."""
     values, vectors = np.linalg.eigh(_hessian(difference))
     # Not convex in all directions: the bodies conform, and no nearest point exists.
     if values[0] <= 0:

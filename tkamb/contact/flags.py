@@ -34,8 +34,8 @@ def narrow_flags(
 ) -> Iterator[str]:
     """Yield a flag for each condyle with too few inner points (see `surrounded`).
 
-    `triangles` (k, 3) join the points; `sides` (n,) are those under each condyle; `points` is the
-    word for them in the message.
+    `triangles` (k, 3) join the points, `sides` (n,) are those under each condyle, and `points` is
+    their word in the message.
     """
     inner = surrounded(triangles, touched)
     for side, under_side in sides.items():
@@ -65,8 +65,9 @@ class EdgeSettings:
     """Definition of a contact at the insert's edge."""
 
     spacing: float = 0.5 * MILLIMETRE
-    """m: spacing of the vertical rays that find the edge. Larger: faster, but the error of the
-    distance from the edge is up to half of this spacing."""
+    """m: spacing of the vertical rays that find the edge, of which half is the error of the
+    distance.
+    """
     steepest: float = 50.0 * DEGREE
     """rad: slope above which a surface near the outline belongs to the rim. No
     loaded part of a dish is as steep."""
@@ -143,7 +144,7 @@ def edge_of_insert_flags(
     sides: Mapping[str, Mask],
     settings: EdgeSettings = EDGE,
 ) -> Iterator[str]:
-    """Yield a flag for each condyle whose contact reaches the edge of the articular surface.
+    """Yield a flag for each condyle whose contact reaches the articular edge.
 
     `sides` (n,) are the map points (n, 3), m, under each condyle.
     """
@@ -184,7 +185,7 @@ UNSUPPORTED = "contact lies over an unsupported bottom"
 
 
 def unmeasured_flags(flags: Iterable[str]) -> list[str]:
-    """Return the flags of contacts for which no model's error is known."""
+    """Return the flags for which no model's error is known."""
     return [flag for flag in flags if MESH_DEFECT in flag or UNSUPPORTED in flag]
 
 
@@ -221,7 +222,7 @@ def mesh_flags(
 
 
 def _below(places: Array, points: Array, reach: float) -> bool:
-    """Return whether a place (m, 3) lies beside a map point (n, 3) and below it."""
+    """Return whether a place (m, 3) lies beside and below a point (n, 3)."""
     distance, near = cKDTree(points[:, [0, 2]]).query(places[:, [0, 2]], distance_upper_bound=reach)
     over = np.isfinite(distance)
     return bool((places[over, 1] < points[near[over], 1]).any())
@@ -230,9 +231,8 @@ def _below(places: Array, points: Array, reach: float) -> bool:
 def unsupported_flags(
     insert: Surface, points: Array, pressure: Array, sides: Mapping[str, Mask]
 ) -> Iterator[str]:
-    """Yield a flag for each condyle with a loaded point whose column does not stand on the bottom.
-
-    Such a column ends above a pocket, a slot, a hole or an overhang.
+    """Yield a flag for each condyle with a loaded column that ends above a pocket, a slot, a hole
+    or an overhang.
     """
     for side, under_side in sides.items():
         highest = float(pressure[under_side].max(initial=0.0))

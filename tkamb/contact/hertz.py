@@ -73,8 +73,6 @@ def contact_ellipse(
 
 
 def _axis_ratio(curvature_ratio: float) -> float:
-    """Return k = b/a for B/A >= 1."""
-
     def excess(log_ratio: float) -> float:
         square = np.exp(2 * log_ratio)
         ratio = elliprd(0.0, 1.0, square) / elliprd(0.0, square, 1.0)
@@ -213,7 +211,7 @@ def condyle_geometry(
 
 
 def indentation(geometry: CondyleGeometry, pose: Array) -> float:
-    """Return delta (m) along the contact normal; negative when apart, NaN without a contact."""
+    """Return delta (m); negative when apart, NaN without a contact."""
     contact = geometry.contact
     if contact is None:
         return float("nan")
@@ -227,7 +225,7 @@ def map_pressure(
     """Return the pressure (n,), Pa, at the samples, and the share of the force on the insert.
 
     It is averaged over sub-cells and scaled so that the vertical force is the patch's force times
-    n_y. If the patch is much narrower than a cell, the nearest point carries all of it.
+    n_y. A patch much narrower than a cell loads the nearest point alone.
     """
     pressure = np.zeros(len(samples.points))
     offset = samples.points - contact.point

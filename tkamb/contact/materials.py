@@ -98,7 +98,7 @@ class RambergOsgood:
 
 @compiled_as_written
 def _solve_ratio(elastic: Array, alpha: float, exponent: float, ratio: Array) -> None:
-    """Write the solutions u (n,) of u + alpha u^n = elastic (n,), which is not negative."""
+    """Write the solutions u (n,) of u + alpha u^n = elastic (n,) >= 0."""
     for k in range(len(elastic)):
         # The solution with the elastic or the plastic term alone is an upper bound of u. Newton's
         # method falls monotonically from the smaller bound, because the function is convex.

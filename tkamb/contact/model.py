@@ -1,7 +1,7 @@
-"""The interface of every contact model (see docs/contact_model.md), and its probe.
+"""The interface of every contact model (docs/contact_model.md), and its probe.
 
-A contact model computes pressure and wrench from the pose of the femoral component in the insert.
-All vectors are in the insert frame (x anterior, y superior, z to the right), in SI units.
+It computes pressure and wrench from the pose of the femoral component in the insert. All vectors
+are in the insert frame (x anterior, y superior, z to the right), in SI units.
 """
 
 import math
@@ -143,7 +143,6 @@ class ProbedContact:
 
     Args:
         condyles: side -> wrench of that condyle; an unloaded condyle is absent.
-        known: False if the model is out of range or has not converged.
         tangent: True if the wrenches have a stiffness.
         exact: True if this is the exact tangent.
         accuracy: 1, relative error of the contact force.

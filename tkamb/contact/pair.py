@@ -23,8 +23,9 @@ if TYPE_CHECKING:
 Bearing = Literal["fixed", "mobile"]
 
 MAX_UNLOADED_APPROACH = 0.5 * MILLIMETRE
-"""m: approach above which a contact without load is out of range. A sphere of 20 mm
-touches between map points of 3 mm up to an approach of 0.06 mm."""
+"""m: approach above which a contact without load is out of range; a sphere of 20 mm touches between
+map points of 3 mm up to 0.06 mm.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +54,7 @@ class ContactPair:
 
     @cached_property
     def first_touch(self) -> FirstTouch:
-        """Query of the travel along -y after which each condyle touches the insert."""
+        """Query of the travel along -y to first touch."""
         return FirstTouch(self.femoral, self.insert, self.split)
 
     @cached_property
@@ -77,8 +78,8 @@ class ContactPair:
     def touch_at(self, pose: Array) -> Touch | None:
         """Return the first touch of either condyle; its travel starts at y = 0.
 
-        y of the pose has no influence. None if the femoral component does not lie over the insert
-        or the pose is not finite. The last eight results are cached.
+        y of the pose has no influence, and the last eight results are cached. None if the femoral
+        component does not lie over the insert or the pose is not finite.
         """
         level = np.array(pose, float)
         if not np.isfinite(level).all():
@@ -97,9 +98,9 @@ class ContactPair:
         return depth if depth > 0 else 0.0
 
     def passed_through(self, pose: Array) -> str | None:
-        """Return the words for an unloaded contact that lies far beyond first touch; else None.
+        """Return words for an unloaded contact far beyond first touch; else None.
 
-        A model whose columns lie inside or above the femoral component finds no contact there.
+        There a model whose columns lie inside or above the femoral component finds no contact.
         """
         approach = self.approach(pose)
         if approach <= MAX_UNLOADED_APPROACH:

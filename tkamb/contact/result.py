@@ -304,7 +304,7 @@ def wrench_of(points: Array, nodal_force: Array) -> Array:
 def _summed(
     chosen: Mask, points: Array, pressure: Array, area: Array, nodal_force: Array, thickness: Array
 ) -> CondyleContact | None:
-    """Return the contact of the chosen points, a mask (n,); None if it is empty.
+    """Return the contact of the chosen points (n,); None if it is empty.
 
     The area is at least force / peak pressure, so that the mean pressure of a contact smaller than
     a cell is not above its peak.
@@ -323,7 +323,7 @@ def _summed(
 def thickness_under(position: Array, points: Array, thickness: Array) -> float:
     """Return the insert's thickness (m) under a position (3,).
 
-    It is the mean of the four map points nearest in x and z, weighted with the inverse distance.
+    It is the mean of the four map points nearest in x and z, by inverse distance.
     """
     square = (points[:, 0] - position[0]) ** 2 + (points[:, 2] - position[2]) ** 2
     near = np.argpartition(square, 3)[:4] if len(points) > 4 else np.arange(len(points))

@@ -11,10 +11,10 @@ The errors of about 0.5 mm and 0.5 deg exceed the deformation. Both are limits o
    press then moves it along y until the contact carries the load, so that this limit does not
    change the medial-lateral split.
 
-Sharma (2008) does not give the centre of the turn. Here it is the component's centre, which
-registration places best. A turn of 0.4 deg about the contact points, 25 mm below, would shift the
-component by 0.2 mm. In dishes little wider than the condyles the contact would move by 1.3 mm, and
-the total force would change by 0.02 BW.
+Sharma (2008) does not give the centre of the turn; here it is the component's, which registration
+places best. A turn of 0.4 deg about the contact points, 25 mm below, would shift the component by
+0.2 mm. In dishes little wider than the condyles the contact would move by 1.3 mm, and the total
+force would change by 0.02 BW.
 
 `tkamb.knee.adjustment` may restore the recorded rotation after the press.
 """
@@ -48,8 +48,9 @@ class AdjustmentSettings:
     """Condition that restores the recorded rotation. "both": penetration and coronal angle after
     the press both exceed the adjustment (Sharma 2008). "either": one of them does."""
     input_change: float = 0.1 * MILLIMETRE
-    """m: error of a recorded gap. A frame is flagged if this error decides whether the recorded
-    rotation is changed. A fifth of the error of fluoroscopy."""
+    """m: error of a recorded gap, a fifth of fluoroscopy's; a frame is flagged if it decides
+    whether the recorded rotation is changed.
+    """
     largest_recorded_gap: float = 3.0 * MILLIMETRE
     """m: if both condyles are farther from the insert, the pose is refused. It is
     more than the errors of fluoroscopy."""
@@ -60,8 +61,7 @@ class AdjustmentSettings:
     """m: difference of the condyles' travel to touch below which both touch together.
     Not studied."""
     max_turns: int = 20
-    """Largest number of steps of the search for the turn at which both condyles touch together.
-    Not studied."""
+    """Most steps of the search for the turn at which both condyles touch together. Not studied."""
 
 
 ADJUSTMENT = AdjustmentSettings()
@@ -132,7 +132,7 @@ def _limited_turn(
     distance: float,
     settings: AdjustmentSettings,
 ) -> tuple[float, tuple[str, ...]]:
-    """Return the turn (rad), 0 beyond the limit, and a flag close to the limit."""
+    """Return the turn (rad), 0 beyond the limit, and a flag close to it."""
     limit, margin = settings.largest_angle, settings.input_change / distance
     if abs(angle) > limit + margin:
         return 0.0, ()
@@ -184,7 +184,7 @@ def _check_near(gaps: CondyleGaps, settings: AdjustmentSettings) -> None:
 
 
 def _coronal_angle(gaps: CondyleGaps) -> tuple[float, float]:
-    """Return coronal angle (rad) and intercondylar distance (m); zero and NaN for one condyle."""
+    """Return coronal angle (rad) and intercondylar distance (m); 0 and NaN for one condyle."""
     if gaps.lateral is None:
         return 0.0, math.nan
     separation = gaps.lateral.point_on_femoral - gaps.medial.point_on_femoral
@@ -195,7 +195,7 @@ def _coronal_angle(gaps: CondyleGaps) -> tuple[float, float]:
 def _levelling_turn(
     query: ClosestPointQuery, recorded: Array, distance: float, settings: AdjustmentSettings
 ) -> float:
-    """Return the turn (rad) at which both condyles touch together, by the secant method."""
+    """Return the turn (rad) at which both touch together, by the secant method."""
 
     def difference(turn: float) -> float:
         medial, lateral = touches(query, _turned(query, recorded, turn))
@@ -234,7 +234,6 @@ def travel_to_touch(query: ClosestPointQuery, at: Array) -> float:
 
 
 def _turned(query: ClosestPointQuery, recorded: Array, turn: float) -> Array:
-    """Turn about the insert's x axis through the component's centre."""
     centre = transform(recorded, query.femoral.bounds.mean(axis=0))
     rotation = Rotation.from_rotvec([turn, 0.0, 0.0]).as_matrix()
     return pose(rotation, centre - rotation @ centre) @ recorded

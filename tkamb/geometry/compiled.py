@@ -1,11 +1,10 @@
 """Decorators for loops that numba compiles at the first call and stores on disk.
 
-The import takes 0.1 to 0.4 s. The compiled code is stored beside the module, or in the user's cache
+The import takes 0.1 to 0.4 s; the compiled code is stored beside the module, or in the user's cache
 (`NUMBA_CACHE_DIR`) if that folder cannot be written. Indices are not checked against bounds.
 
-A compiled function may call compiled functions of other files, because its stored name contains a
-hash of these files. Numba's cache detects changes of its own file only, so it uses no other name of
-another file.
+Numba's cache detects changes of its own file only: a compiled function may call those of other
+files, because its stored name contains a hash of these, but uses no other name of them.
 """
 
 import hashlib
@@ -58,7 +57,7 @@ def _compiled(function: Function, fastmath: set[str], **more: Any) -> Function:
 
 
 def _name_by_files(function: Any) -> None:
-    """Add a hash of the other files of called functions to the name of the stored code."""
+    """Add a hash of called functions' files to the name of the stored code."""
     own, values = {function.__code__.co_filename}, function.__globals__
     called = [getattr(values.get(name), "py_func", None) for name in function.__code__.co_names]
     function.files = own.union(*(getattr(one, "files", ()) for one in called))

@@ -49,7 +49,7 @@ class CurvedSurface:
 
     @classmethod
     def of(cls, surface: "Surface") -> "CurvedSurface":
-        """Return the patches of a surface from its corner normals."""
+        """Return the patches of a surface by its corner normals."""
         finer = coarsened(surface.vertices, surface.faces)
         if finer is not None:
             surface = surface.remade(surface.vertices, finer.faces)
@@ -58,7 +58,7 @@ class CurvedSurface:
 
     @cached_property
     def _patches(self) -> Array:
-        """Corner normals, sagittas and normal of each triangle (k, 15)."""
+        """Corner normals, sagittas and normal, (k, 15)."""
         return np.hstack([self.normals.reshape(-1, 9), self.sagittas, self.surface.face_normals])
 
     def shift(self, faces: Index, weights: Array, direction: Array) -> tuple[Array, Array]:
@@ -172,7 +172,7 @@ def _shifts(patches: Array, faces: Index, weights: Array, direction: Array) -> t
 
 
 def _sagittas(surface: "Surface", normals: Array) -> Array:
-    """Return the sagittas (k, 3), m, of the edges opposite each corner."""
+    """Return the sagittas (k, 3), m, opposite each corner."""
     corners = surface.triangles
     lean = np.einsum("kij,kj->ki", normals, surface.face_normals)
     slant = normals / np.where(lean > 0.0, lean, np.inf)[..., None]

@@ -137,7 +137,7 @@ def _opening(surface: "Surface", loop: BoundaryLoop) -> Defect:
 
     The cap is a paraboloid over the loop's mean plane, with half the mean height of the loop's
     tangent planes above the centre. If the surface lies within the loop, like a sheet within its
-    edge, no cap is missing, and the points are the edge.
+    edge, the points are the edge.
     """
     ring = surface.vertices[loop.vertices]
     words = f"an opening {loop.width / MILLIMETRE:.2g} mm wide"
@@ -158,7 +158,7 @@ def _opening(surface: "Surface", loop: BoundaryLoop) -> Defect:
 
 
 def _inward(surface: "Surface", loop: BoundaryLoop) -> float:
-    """Return the mean cosine between the surface beside a loop and the way to the loop's centre."""
+    """Return the mean cosine between the surface beside a loop and the way to its centre."""
     on_loop = np.isin(surface.corner_vertices, loop.vertices)
     beside = on_loop.sum(axis=1) == 2
     corners = surface.vertices[surface.corner_vertices[beside]]
@@ -171,7 +171,7 @@ def _inward(surface: "Surface", loop: BoundaryLoop) -> float:
 
 
 def _normals(surface: "Surface") -> Array:
-    """Return the area-weighted unit normal (n, 3) of each vertex; zero for an unused one."""
+    """Return area-weighted unit normals (n, 3); zero for unused vertices."""
     weighted = surface.areas[:, None] * surface.face_normals
     vertex = surface.corner_vertices.ravel()
     rows = np.repeat(weighted, 3, axis=0)
@@ -181,10 +181,9 @@ def _normals(surface: "Surface") -> Array:
 
 
 def _heights(points: Array, normals: Array, near: Index) -> tuple[Array, Array]:
-    """Return each point's height (n,), m, over its neighbours' quadric, and their residual (n,).
+    """Return heights (n,), m, over the neighbours' quadric, and its root mean square residual (n,).
 
-    The residual is the root mean square of the neighbours' distances from the quadric. Both are
-    zero where neighbours lie beyond a crease or do not determine a quadric.
+    Both are zero beside a crease, or without a determined quadric.
     """
     axis = normals[near].sum(axis=1)
     axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-12)
@@ -214,7 +213,7 @@ def _heights(points: Array, normals: Array, near: Index) -> tuple[Array, Array]:
 
 
 def _steps(surface: "Surface") -> Defect | None:
-    """Return the steps of a surface of voxels; None if it is none."""
+    """Return the steps of a surface of voxels, or None."""
     normals, areas = surface.face_normals, surface.areas
     key = np.round(normals / 0.02).astype(np.int64) @ [1, 1000, 1000000]
     _, group = np.unique(key, return_inverse=True)

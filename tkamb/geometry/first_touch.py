@@ -13,17 +13,17 @@ from tkamb.geometry.nearest import TriangleTree
 from tkamb.geometry.surface import Surface
 
 STEEP = 1e-9
-"""1: ratio of a triangle's area in the plan view to its area below which the triangle is a wall and
-is skipped. The edges of a wall are edges of its neighbours."""
+"""1: ratio of a triangle's area in the plan view to its area below which it is a wall and skipped;
+its edges are those of its neighbours.
+"""
 FACING = 0.2
 """1: smallest vertical component of a mean normal with which its plane is used as a bound."""
 ROUNDING = 1e-12
 """m: rounding error of a plane's height."""
 MOST_WAITING = 256
-"""Largest number of pairs of boxes on the stack: two for each level of both trees."""
+"""Most pairs of boxes on the stack: two for each level of both trees."""
 MOST_CORNERS = 9
-"""Largest number of corners of a triangle cut by another triangle: six, and up to nine by
-rounding."""
+"""Most corners of a triangle cut by another one: six, and up to nine by rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +46,8 @@ class FirstTouch:
     both cover in the plan view; the difference is linear, so it is smallest at a corner. Pairs of
     boxes and triangles without a smaller clearance than the smallest so far are skipped.
 
-    `split` is z (m, femoral frame) between the condyles; None for one condyle, which is medial. The
-    centroid of a triangle decides its side.
+    `split` is z (m, femoral frame) between the condyles (None: one condyle, medial); a triangle's
+    centroid decides its side.
     """
 
     def __init__(self, femoral: Surface, insert: Surface, split: float | None = None) -> None:
@@ -117,7 +117,7 @@ def _bound(
     rotation: Array,
     translation: Array,
 ) -> float:
-    """Return a lower bound (m) of the clearance of the triangles in two boxes.
+    """Return a lower bound (m) of the clearance of two boxes' triangles.
 
     It is the larger of the boxes' clearance and of their planes' over the rectangle that both
     cover; inf if they do not overlap in the plan view. Boxes (6,) are in the lower body's frame,
@@ -171,7 +171,7 @@ def _over(upper: Array, lower: Array) -> bool:
 
 @compiled_as_written
 def _beyond(upper: Array, plane: tuple[float, float, float, float]) -> float:
-    """Return the smallest height (m) of a triangle's corners (9,) above another one's plane."""
+    """Return the smallest height (m) of corners (9,) above a plane."""
     least = np.inf
     for corner in range(0, 9, 3):
         height = plane[0] + plane[1] * upper[corner] + plane[2] * upper[corner + 2]
@@ -190,9 +190,9 @@ def _cut(
     bz: float,
     way: float,
 ) -> int:
-    """Write the part of a polygon on one side of the line from a to b; return its corner count.
+    """Write a polygon's part beside the line from a to b; return its corner count.
 
-    A corner (3,) is x, z and clearance, m. `way`, 1 or -1, selects the side.
+    A corner (3,) is x, z and clearance, m; `way`, 1 or -1, selects the side.
     """
     number = 0
     for corner in range(count):
@@ -226,7 +226,7 @@ def _over_each_other(
     spare: Array,
     point: Array,
 ) -> float:
-    """Return the smaller of the clearance (m) of two triangles and `best`, the smallest so far.
+    """Return the smaller of two triangles' clearance (m) and `best`, the smallest so far.
 
     Corners `upper` and `lower` (9,), m, are in the lower body's frame; `plane` is that of `lower`
     (`_plane`), its area is not zero. `polygon` and `spare` (`MOST_CORNERS`, 3) are work arrays;
@@ -266,8 +266,8 @@ def _least_clearance(
     """Return the smallest clearance (m) of two surfaces, and its place (3,), m, on the lower one.
 
     Boxes (2 p, 6), supports (2 p, 4) and corners (p c, 9) are those of `TriangleTree`, in the frame
-    of each surface; the pose is the upper frame in the lower. The clearance is inf if the surfaces
-    do not overlap in the plan view.
+    of each surface; the pose is the upper frame in the lower. It is inf if they do not overlap in
+    the plan view.
     """
     best, point = np.inf, np.full(3, np.nan)
     uppers, lowers = len(upper_boxes) // 2, len(lower_boxes) // 2

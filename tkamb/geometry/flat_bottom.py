@@ -65,9 +65,9 @@ class FlatBottom:
 def find_flats(surface: Surface) -> list[FlatBottom]:
     """Return the flats that may be the bottom, largest first.
 
-    Triangles are weighted by area. The search finds the direction that most triangles face, then
-    the most frequent offset of those within 15 deg of it, and fits a plane to them with decreasing
-    tolerances. It is repeated without this flat until no flat of comparable area remains.
+    The search finds the direction that the most area faces, then the most frequent offset of
+    triangles within 15 deg of it, and fits a plane to them with decreasing tolerances. It is
+    repeated without this flat until none of comparable area remains.
     """
     normals, area = surface.face_normals, surface.areas
     free = area > 0
@@ -88,11 +88,11 @@ def find_flats(surface: Surface) -> list[FlatBottom]:
 def find_flat_bottom(surface: Surface, rotation: Array | None = None) -> FlatBottom:
     """Return the bottom of an insert: the largest flat that faces -y, within 30 deg.
 
-    Its area must be at least half of the largest flat's area. A notice is printed if its area is
-    clearly smaller.
+    Its area must be at least half of the largest flat's; a notice is printed if it is clearly
+    smaller.
 
-    `surface` is in anatomical axes (x anterior, y superior, z right), m. `rotation` (3, 3) from
-    mesh axes to these serves the messages.
+    `surface` is in anatomical axes (x anterior, y superior, z right), m; `rotation` (3, 3) from
+    mesh axes to these is for messages.
     """
     rotation = np.eye(3) if rotation is None else rotation
     flats = find_flats(surface)
@@ -131,7 +131,7 @@ def find_flat_bottom(surface: Surface, rotation: Array | None = None) -> FlatBot
 
 
 def _is_inner(surface: Surface, flat: FlatBottom) -> bool:
-    """Return whether material lies in front of most of a flat."""
+    """Return whether material lies before most of a flat."""
     area = surface.areas[flat.faces]
     return bool(area @ facing_material(surface, flat.faces) > INNER_SHARE * area.sum())
 
@@ -157,8 +157,8 @@ def _faces_elsewhere(name: str, flat: FlatBottom, rotation: Array) -> InputError
 def insert_placement(surface: Surface, rotation: Array | None = None) -> Array:
     """Return the pose (4, 4) of the insert's mesh, turned to anatomical axes, in the insert frame.
 
-    The plane y = 0 of the insert frame is the flat bottom, which faces -y. The origin is the centre
-    of the bottom's bounding rectangle in x and z. The smallest rotation turns a tilted mesh level.
+    Its plane y = 0 is the flat bottom, which faces -y, with the origin at the centre of its
+    bounding rectangle. The smallest rotation turns a tilted mesh level.
 
     `surface` and `rotation`: see `find_flat_bottom`.
     """
@@ -197,7 +197,7 @@ def _levelling(normal: Array) -> Array:
 def _largest_flat(
     surface: Surface, normals: Array, area: Array, free: Mask, least: float
 ) -> FlatBottom | None:
-    """Return the largest flat of the free triangles; None if all are smaller than `least` (m²)."""
+    """Return the largest flat of free triangles; None below `least` (m²)."""
     best: FlatBottom | None = None
     for seed in _peaks(normals[free], area[free]):
         near = np.flatnonzero(free & (normals @ seed > math.cos(_CONE)))
@@ -210,7 +210,7 @@ def _largest_flat(
 
 
 def _peaks(normals: Array, area: Array) -> list[Array]:
-    """Return the directions (3,) that the most area faces: at most 8, at least 15 deg apart."""
+    """Return the directions (3,) that most area faces: at most 8, 15 deg apart or more."""
     # Each cell of the unit sphere has one number, because `np.unique` is slower on rows.
     number = np.round(normals * 6.0).astype(np.int64) @ [400, 20, 1]
     cells, cell = np.unique(number, return_inverse=True)
@@ -264,7 +264,7 @@ def _grown(
 
 
 def _sharpened(direction: Array, normals: Array, weight: Array) -> Array:
-    """Return the mean normal (3,) in a cone around a direction; the cone is narrowed in steps."""
+    """Return the mean normal (3,) in a cone that is narrowed in steps."""
     for cone in np.radians([15.0, 8.0, 4.0, 2.0, 2.0]):
         mean = (weight * (normals @ direction > math.cos(cone))) @ normals
         length = np.linalg.norm(mean)
@@ -275,7 +275,7 @@ def _sharpened(direction: Array, normals: Array, weight: Array) -> Array:
 
 
 def _densest(offsets: Array, weight: Array, window: float) -> float:
-    """Return the mean offset (m) in the window of offsets that contains the most area."""
+    """Return the mean offset (m) in the window with the most area."""
     order = np.argsort(offsets)
     offsets, total = offsets[order], np.concatenate([[0.0], np.cumsum(weight[order])])
     last = np.searchsorted(offsets, offsets + window, side="right")
@@ -291,7 +291,7 @@ def _median(values: Array, weight: Array) -> float:
 
 
 def _plane(corners: Array, weight: Array, towards: Array) -> tuple[Array, float]:
-    """Return normal (3,) and offset (m) of the least-squares plane over the area of triangles."""
+    """Return normal (3,) and offset (m) of the least-squares plane, by area."""
     total = weight.sum()
     middle = corners.mean(axis=1)
     centre = weight @ middle / total

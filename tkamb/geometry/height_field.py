@@ -1,13 +1,13 @@
 """The intervals in which the lines of a structured grid run inside a closed surface.
 
-Every triangle is compared with the lines that cross its bounding rectangle. The signs of three
-areas, which are exact integers (`tkamb.geometry.winding.PlanGrid`), determine whether a line passes
-through it, so that none passes between two triangles. A line that meets an edge exactly is moved by
-an infinitesimal distance into each quadrant around it (simulation of simplicity, see
+Every triangle is compared with the lines that cross its bounding rectangle: signs of three areas,
+which are exact integers (`tkamb.geometry.winding.PlanGrid`), decide whether one passes through it,
+so that none passes between two triangles. A line that meets an edge exactly is moved by an
+infinitesimal distance into each quadrant around it (simulation of simplicity, see
 `tkamb.geometry.winding`). A place that is inside in any of these cases counts as inside, so that a
 line along a wall belongs to the body.
 
-A place is inside if more entries than exits lie below it. A wall between two touching bodies does
+A place is inside if more entries than exits lie below it: a wall between two touching bodies does
 not end an interval, and a void stays empty. A line through a hole of the mesh has unequal numbers
 of entries and exits; its crossings are paired in order.
 """
@@ -103,10 +103,10 @@ def united(line: Index, lower: Array, upper: Array) -> tuple[Index, Array, Array
 def _crossings(
     surface: Surface, axis: int, first: Array, second: Array
 ) -> tuple[Index, Array, Mask, Mask]:
-    """Return line (m,), height (m,), m, `rising` and counts (4, m) of all lines' crossings.
+    """Return line (m,), height (m,), m, `rising` (the triangle faces along the line) and counts (4,
+    m) of all crossings.
 
-    `rising`: the triangle faces along the line. Counts: whether the line passes through the
-    triangle when moved into each quadrant.
+    Counts are whether the line passes through it when moved into each quadrant.
     """
     across, along = [(axis + 1) % 3, (axis + 2) % 3], axis
     flat = surface.vertices[:, across]
@@ -178,7 +178,7 @@ def _signed_areas(
 
 
 def _paired(line: Index, height: Array, rising: Mask, count: int) -> tuple[Index, Array]:
-    """Return sorted line and height of all entries and exits; a `rising` crossing is an exit."""
+    """Return sorted line and height of all ends; a `rising` crossing is an exit."""
     step = np.where(rising, -1, 1)
     closed = (np.bincount(line, step, minlength=count) == 0)[line]
     lines, heights = _distinct(line[~closed], height[~closed], rising[~closed])
@@ -198,7 +198,7 @@ def _paired(line: Index, height: Array, rising: Mask, count: int) -> tuple[Index
 
 
 def _distinct(line: Index, height: Array, rising: Mask) -> tuple[Index, Array]:
-    """Return line and height of the crossings, sorted; duplicate faces count once."""
+    """Return the sorted crossings; duplicate faces count once."""
     order = np.lexsort((height, rising, line))
     line, height, rising = line[order], height[order], rising[order]
     keep = np.ones(len(line), bool)
@@ -238,7 +238,7 @@ def _repaired(
 
 
 def _around(ray: int, odd: Mask, shape: tuple[int, int]) -> list[int]:
-    """Return those of the eight neighbouring lines that have an even number of crossings."""
+    """Return those of the eight neighbours with an even number of crossings."""
     a, b = divmod(ray, shape[1])
     near = [(a + i, b + k) for i in (-1, 0, 1) for k in (-1, 0, 1) if i or k]
     inside = [n for n in near if 0 <= n[0] < shape[0] and 0 <= n[1] < shape[1]]
@@ -246,9 +246,8 @@ def _around(ray: int, odd: Mask, shape: tuple[int, int]) -> list[int]:
 
 
 def _completed(crossings: Array, neighbours: list[Array]) -> Array | None:
-    """Return a line's crossings (n,), n odd, after one was added or removed.
-
-    None if the `neighbours`' crossings differ; all in m.
+    """Return a line's crossings (n,), n odd, with one added or removed; None if its `neighbours`
+    differ; all in m.
     """
     for count in (len(crossings) + 1, len(crossings) - 1):
         fitting = [n for n in neighbours if len(n) == count]

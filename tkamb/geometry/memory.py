@@ -17,8 +17,8 @@ OWN = Path("/proc/self/statm")
 def peak_rss(process: int | None = None) -> float:
     """Return the largest resident memory of a process so far, MB (1e6 bytes).
 
-    /proc is read where it exists, because `getrusage` includes memory of the parent process. NaN
-    for another process without an entry there. The default is this process.
+    /proc is read where it exists, because `getrusage` includes the parent's memory. NaN for another
+    process without an entry there. Default: this process.
     """
     with suppress(OSError):
         status = Path(f"/proc/{process or os.getpid()}/status").read_text()
@@ -42,7 +42,7 @@ def available_memory() -> float:
 
 
 def _machine() -> float:
-    """Return the machine's available memory, bytes, including caches that can be dropped."""
+    """Caches that can be dropped are included, bytes."""
     try:
         for line in STATISTICS.read_text().splitlines():
             if line.startswith("MemAvailable:"):
@@ -56,7 +56,7 @@ def _machine() -> float:
 
 
 def _group() -> float:
-    """Return the rest of the control group's memory limit, bytes; inf without a limit."""
+    """Return the rest of the control group's limit, bytes, or inf."""
     pairs = (
         ("memory.max", "memory.current"),
         ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
@@ -71,7 +71,7 @@ def _group() -> float:
 
 
 def _address_space() -> float:
-    """Return the rest of the limit of address space (`ulimit -v`), bytes; inf without a limit."""
+    """Return the rest of `ulimit -v`, bytes, or inf."""
     soft, _ = resource.getrlimit(resource.RLIMIT_AS)
     if soft == resource.RLIM_INFINITY:
         return float("inf")
@@ -85,8 +85,8 @@ def _address_space() -> float:
 def give_back() -> None:
     """Collect reference cycles, and return freed memory to the system (with glibc).
 
-    A knee with its meshes has reference cycles, which Python collects by number, not by size.
-    Eighteen knees in turn used 0.73 GB, but 0.38 GB with a collection after each. glibc keeps freed
+    A knee with its meshes has reference cycles, which Python collects by number, not by size:
+    eighteen knees in turn used 0.73 GB, but 0.38 GB with a collection after each. glibc keeps freed
     memory between used blocks.
     """
     gc.collect()

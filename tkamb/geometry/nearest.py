@@ -1,10 +1,9 @@
 """Nearest points of a triangulated surface, its tree of bounding boxes, and surface samples.
 
-The tree divides the triangles at the median along the longest side of their box, until a leaf
-contains a few. All leaves are at one depth: the children of box i are 2i and 2i + 1, the root is 1.
-A search visits the nearer child first and skips boxes farther away than the best result so far; its
-result does not depend on the order. `tkamb.geometry.rays` and `tkamb.geometry.first_touch`
-search the same tree.
+The tree halves the triangles along the longest side of their box, until a leaf contains a few. All
+leaves are at one depth: the children of box i are 2i and 2i + 1, the root is 1. A search visits the
+nearer child first and skips boxes farther away than the best result so far; its result does not
+depend on the order.
 """
 
 from dataclasses import dataclass
@@ -73,8 +72,8 @@ class TriangleTree:
     def supports(self) -> Array:
         """Plane of each box (2 p, 4); all triangles of the box lie behind its plane.
 
-        A row contains the unit normal n and the offset n . x (m). The normal is the mean normal of
-        the triangles, or zero if the mean vanishes.
+        A row is the unit normal n, the triangles' mean or zero if that vanishes, and the offset n .
+        x (m).
         """
         count = len(self.boxes) // 2
         planes = np.zeros((2 * count, 4))
@@ -91,7 +90,7 @@ class TriangleTree:
 
 
 def _halved(centres: Array) -> Index:
-    """Return the triangles (p, c) of the p leaves; some appear twice, to fill the rows."""
+    """Return triangles (p, c) of p leaves; some appear twice, to fill the rows."""
     leaves = 1
     while leaves * TRIANGLES_PER_LEAF < len(centres):
         leaves *= 2
@@ -103,7 +102,7 @@ def _halved(centres: Array) -> Index:
 
 @compiled_as_written
 def _halve(centres: Array, order: Index, leaves: int) -> None:
-    """Sort triangle numbers `order` (m,) in place into leaves, halving along the longest side.
+    """Sort triangle numbers (m,) into leaves, halving along the longest side.
 
     `leaves` is a power of two and divides m. `centres` (n, 3), m, are those of the triangles'
     boxes.
@@ -125,7 +124,7 @@ def _halve(centres: Array, order: Index, leaves: int) -> None:
 
 @compiled_as_written
 def _part(centres: Array, order: Index, axis: int, first: int, last: int, middle: int) -> None:
-    """Move smaller values along `axis` in order[first : last + 1] before `middle` (Hoare 1961)."""
+    """Move smaller values along `axis` before `middle` (Hoare 1961)."""
     while first < last:
         pivot = centres[order[(first + last) // 2], axis]
         low, high = first, last
@@ -152,7 +151,7 @@ MAX_SAMPLES = 150_000
 FLAT = 1e-14
 """1: a triangle counts as a line if 4 area² / (edge² edge²) is smaller."""
 DEEPEST = 64
-"""Largest number of boxes on the stack of a search: one per level of the tree."""
+"""Most boxes on the stack of a search: one per level of the tree."""
 NO_TRIANGLE = -1
 
 
@@ -193,7 +192,7 @@ class NearestPoints:
     def at(self, points: ArrayLike) -> Nearest:
         """Return the points of the surface nearest to `points` (n, 3), m, in the surface's frame.
 
-        The result of a point that is not finite is the distance inf, triangle -1 and NaN weights.
+        A point that is not finite has the distance inf, triangle -1 and NaN weights.
         """
         return self._search(points, np.inf)
 
@@ -210,7 +209,7 @@ class NearestPoints:
 
 
 def sampled(surface: "Surface", spacing: float) -> tuple[Array, Index, Array]:
-    """Return samples (n, 3) of a surface, and the triangle (n,) and area (n,) of each sample.
+    """Return samples (n, 3) of a surface, with triangle (n,) and area (n,).
 
     They are centres of similar parts of a triangle with edges of at most `spacing` (m). The spacing
     is increased if there are more than `MAX_SAMPLES`.
@@ -232,7 +231,7 @@ def sampled(surface: "Surface", spacing: float) -> tuple[Array, Index, Array]:
 
 
 def _centres(n: int) -> Array:
-    """Return barycentric centres (n², 3) of the parts of a triangle with n parts per edge."""
+    """Return barycentric centres (n², 3) of parts, n per edge."""
     i, j = np.divmod(np.arange(n * n), n)
     upright, inverted = i + j < n, i + j < n - 1
     first = np.concatenate([i[upright] + 1 / 3, i[inverted] + 2 / 3]) / n
@@ -259,7 +258,7 @@ def _foot(corners: Array, point: Array) -> tuple[float, float, float]:
     """Return the squared distance (m²) of a triangle's nearest point and its barycentrics 2 and 3.
 
     It is the projection onto the plane if inside, else the nearest one onto an edge. Without
-    absolute tolerances the result is correct for triangles of any size.
+    absolute tolerances it is correct for any size.
     """
     ux, uy, uz = corners[3] - corners[0], corners[4] - corners[1], corners[5] - corners[2]
     vx, vy, vz = corners[6] - corners[0], corners[7] - corners[1], corners[8] - corners[2]
@@ -300,11 +299,11 @@ def _nearest_place(
     stack: Index,
     squares: Array,
 ) -> tuple[int, float, float, float]:
-    """Return place in `faces`, squared distance (m²) and barycentrics 2 and 3 of the nearest point.
+    """Return the nearest point: place in `faces`, squared distance (m²), barycentrics 2 and 3.
 
     Of equally near triangles it is the one with the lowest number; -1 if none is within `reach`
-    (m). Boxes, faces and corners: see `TriangleTree`. `guess` is the place of a triangle that is
-    probably near, which saves time, or -1; `stack` and `squares` (`DEEPEST`,) are work arrays.
+    (m). Boxes, faces and corners: see `TriangleTree`. `guess`, a place probably near or -1, saves
+    time; `stack` and `squares` (`DEEPEST`,) are work arrays.
     """
     leaves, place, size = len(boxes) // 2, NO_TRIANGLE, 1
     leaf_size = len(faces) // leaves

@@ -75,7 +75,7 @@ def sagittal_outline(
 def _outline(
     surfaces: tuple[Surface, ...], z_values: tuple[float, ...], offset: float, below: float
 ) -> Array:
-    """Return the result of `sagittal_outline`; the last four are cached."""
+    """The last four results are cached."""
     cuts = [sagittal_section(surface, z) for surface in surfaces for z in z_values]
     points = _points_below(np.concatenate([*cuts, np.empty((0, 2, 2))]), below - offset)
     if len(points) == 0:
@@ -91,7 +91,7 @@ def _outline(
 
 
 def _points_below(segments: Array, y: float) -> Array:
-    """Return the ends (n, 2) of the parts of segments (k, 2, 2) below y (m)."""
+    """Return ends (n, 2) of the parts of segments (k, 2, 2) below y (m)."""
     if np.isfinite(y):
         low, high = np.sort(segments[:, :, 1], axis=1).T
         a, b = segments[(low < y) & (high > y)].transpose(1, 0, 2)
@@ -118,8 +118,8 @@ class CrossedPolygonError(ValueError):
 def triangulated(vertices: Array, corners: Index, ends: Index) -> Index:
     """Return polygons as triangles (k, 3) with the winding of the polygons.
 
-    A convex polygon becomes a fan about its first corner. From a concave polygon ears are cut off
-    one by one (Meisters, Am Math Monthly 82:648, 1975). Polygons with fewer than three corners are
+    A convex polygon becomes a fan about its first corner; from a concave one ears are cut off one
+    by one (Meisters, Am Math Monthly 82:648, 1975). Those with fewer than three corners are
     skipped.
 
     Args:
@@ -193,7 +193,7 @@ def ears(vertices: Array, ring: Index, normal: Array) -> Index:
 def _is_ear(
     points: Array, remaining: list[int], ear: tuple[int, int, int], least: float, flat: bool
 ) -> bool:
-    """Return whether a corner is an ear: it is convex, and its triangle contains no other corner.
+    """Return whether a corner is convex, and its triangle contains no other.
 
     `ear` are predecessor, corner and successor, `remaining` the corners not cut off. Below `least`
     twice the area a triangle counts as a line, and with `flat` a corner on a line as an ear.

@@ -1,8 +1,8 @@
 """The post of an insert: its search, and its separation from the dishes.
 
-In a posterior-stabilised insert a cam of the femoral component pushes against the post from behind.
-Contact models that press along y do not include this. `divide_insert` therefore divides the insert
-into the dishes for the condyles and the post for the cam.
+In a posterior-stabilised insert a cam of the femoral component pushes it from behind, which contact
+models that press along y do not include: `divide_insert` divides the insert into the dishes for the
+condyles and the post for the cam.
 """
 
 from dataclasses import dataclass
@@ -51,8 +51,9 @@ LEAST_THICKNESS = 2e-3
 
 
 FOOT_RING = (3, 5)
-"""Inner and outer distance, in lines, of a ring around the post. The height of the surroundings is
-measured in this ring, which lies beyond the slanted sides of the post."""
+"""Inner and outer distance, in lines, of a ring around the post, beyond its slanted sides, where
+the surroundings' height is measured.
+"""
 
 
 @dataclass(frozen=True)
@@ -144,14 +145,14 @@ def divide_insert(insert: Surface) -> tuple[Surface, Surface]:
 
 
 def _ground(top: Array, patch: Mask, dish: float) -> float:
-    """Return the largest y (m) of the surface around a patch; `dish` if there is none."""
+    """Return the largest y (m) around a patch; `dish` if there is none."""
     near, far = (binary_dilation(patch, iterations=n) for n in FOOT_RING)
     ring = top[far & ~near]
     return float(ring[np.isfinite(ring)].max(initial=dish))
 
 
 def _steep_share(top: Array, patch: Mask) -> float:
-    """Return the share of the lines around a patch that end at least `side_drop` below the edge."""
+    """Return the share of lines around a patch that end at least `side_drop` below its edge."""
     near = binary_dilation(patch)
     around = binary_dilation(near, iterations=1) & ~near
     edge = float(np.median(top[patch & binary_dilation(~patch)]))

@@ -34,7 +34,7 @@ STILL = 1e-200
 PARALLEL = 1e-9
 """1: sine of the angle between ray and triangle below which they do not cross."""
 DEEPEST = 64
-"""Largest number of boxes on the stack of a search: one per level of the tree."""
+"""Most boxes on the stack of a search: one per level of the tree."""
 NO_TRIANGLE = -1
 """Number in place of a triangle where a ray crosses none."""
 
@@ -80,9 +80,9 @@ class RayCaster:
     def last_exit(self, origins: ArrayLike, directions: ArrayLike) -> Array:
         """Return the distance (n,), m, of the first exit that counts on each ray; inf without exit.
 
-        Two kinds of exit do not count: through an inner wall, where the next shell begins at the
-        same place, and into a closed void, which has a shell of its own. An exit into an undercut
-        counts, although the ray enters the body again behind it.
+        An exit through an inner wall, where the next shell begins, or into a closed void, which has
+        its own shell, does not count; one into an undercut does, although the ray enters again
+        behind it.
 
         Arguments as in `first`.
         """
@@ -158,7 +158,7 @@ class RayCaster:
     def _merged(
         self, ray: Index, t: Array, face: Index, directions: Array
     ) -> tuple[Index, Array, Index]:
-        """Return the sorted crossings, one for those of the same place and facing."""
+        """Return the sorted crossings, one for each place and facing."""
         along = directions[ray] if len(directions) > 1 else directions
         entering = (along * self.surface.face_normals[face]).sum(axis=1) < 0.0
         order = np.lexsort((face, t, entering, ray))
@@ -182,8 +182,8 @@ def _rays(origins: ArrayLike, directions: ArrayLike) -> tuple[Array, Array]:
 def _crossing(plane: Array, origin: Array, direction: Array) -> tuple[float, float, float]:
     """Return the distance (m) of a ray to a triangle's plane, and barycentrics 2 and 3.
 
-    `plane` (12,): first corner, unit normal and `Surface.barycentric_rows`. The distance is inf if
-    the ray is parallel to the plane or the triangle has no area.
+    `plane` (12,): first corner, unit normal and `Surface.barycentric_rows`. The distance is inf for
+    a parallel ray or a triangle without area.
     """
     x, y, z = origin[0] - plane[0], origin[1] - plane[1], origin[2] - plane[2]
     slope = direction[0] * plane[3] + direction[1] * plane[4] + direction[2] * plane[5]
@@ -212,9 +212,8 @@ def _entry(box: Array, origin: Array, slowness: Array) -> float:
 
 @compiled_as_written
 def _set_direction(vector: Array, direction: Array, slowness: Array) -> None:
-    """Write the unit vector of a vector (3,), and its finite inverse components.
-
-    A vector of zero length gives NaN, and its ray has no crossing.
+    """Write the unit vector of a vector (3,), and its finite inverse components; NaN, without
+    crossings, for zero length.
     """
     length = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
     for axis in range(3):
@@ -289,9 +288,10 @@ def ray_work() -> tuple[Array, Array, Index, Array]:
 def _first_crossings(
     tree: tuple[Array, Index, Array, float], origins: Array, directions: Array
 ) -> tuple[Array, Index, Array]:
-    """Return distance (n,), m, triangle (n,) and barycentrics (n, 3) of each ray's first crossing.
+    """Return each ray's first crossing: distance (n,), m, triangle (n,) and barycentrics (n, 3);
+    inf, -1 and NaN for none.
 
-    inf, -1 and NaN without a crossing. `directions` (n, 3) of any length, or (1, 3) for all rays.
+    `directions` are (n, 3) of any length, or (1, 3) for all rays.
     """
     count, (_, faces, planes, _) = len(origins), tree
     distance, face = np.full(count, np.inf), np.full(count, NO_TRIANGLE)
@@ -315,7 +315,7 @@ def _all_crossings(
     distance: Array,
     face: Index,
 ) -> int:
-    """Return the number of all crossings, and write those that fit into the output arrays (m,)."""
+    """Return the number of all crossings, and write those that fit (m,)."""
     boxes, faces, planes, same = tree
     leaves, number = len(boxes) // 2, 0
     leaf_size = len(faces) // leaves

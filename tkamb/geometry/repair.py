@@ -42,7 +42,7 @@ TRIANGLE_WIDTH = 5e-3
 
 @dataclass(frozen=True, eq=False)
 class Repair:
-    """A repaired surface and the notices of its repairs.
+    """A repaired surface, with notices.
 
     Args:
         faces: (k, 3) vertices of the triangles, with consistent winding; outward if closed.
@@ -63,9 +63,8 @@ class Repair:
 def repair(vertices: Array, faces: Index) -> Repair:
     """Repair duplicate and degenerate faces, winding, cracks, small holes and loose vertices.
 
-    Equal vertices are merged without a notice, because in an STL file every triangle has separate
-    vertices. A triangle without area but with three different corners stays, because it closes the
-    surface.
+    Equal vertices are merged without a notice, because STL triangles have separate vertices. A
+    triangle without area but with three corners stays: it closes the surface.
     """
     unused = len(vertices) - int(_used(vertices, faces).sum())
     vertices, faces = _merged(vertices, faces)
@@ -119,7 +118,7 @@ def _without_collapsed(faces: Index) -> tuple[Index, int]:
 
 
 def _without_duplicates(faces: Index) -> tuple[Index, int]:
-    """Remove duplicates of a face, and both of a pair with opposite winding; count the removed."""
+    """Remove duplicates of a face, and both of an opposite pair; count them."""
     corners = np.sort(faces, axis=1)
     most = int(faces.max(initial=0)) + 1
     _, pair = np.unique(corners[:, 0] * most + corners[:, 1], return_inverse=True)
@@ -149,9 +148,9 @@ def _without_duplicates(faces: Index) -> tuple[Index, int]:
 def _wound(vertices: Array, faces: Index) -> tuple[Index, int, bool]:
     """Reverse faces so that neighbours have consistent winding; the smaller area is reversed.
 
-    Every face has two states, original and reversed; a graph connects consistent states of
-    neighbours. Both states are in one component only on a one-sided surface. Also returns the
-    number of reversed faces, and whether the surface is one-sided.
+    A graph connects the consistent states (original, reversed) of neighbours. Both states of a face
+    are in one component only on a one-sided surface. Also returns the number of reversed faces, and
+    whether the surface is one-sided.
     """
     k = len(faces)
     edge, count = edge_use(faces)
@@ -179,7 +178,7 @@ def _wound(vertices: Array, faces: Index) -> tuple[Index, int, bool]:
 
 
 def _welded(vertices: Array, faces: Index) -> tuple[Index, int]:
-    """Merge vertices of open edges within `WELD_DISTANCE` of each other; count them."""
+    """Merge vertices of open edges within `WELD_DISTANCE`; count them."""
     loose = np.unique(open_edges(faces))
     if len(loose) == 0:
         return faces, 0
@@ -217,7 +216,7 @@ def _filled(vertices: Array, faces: Index) -> tuple[Array, Index, int, float]:
 
 
 def _outward(vertices: Array, faces: Index) -> tuple[Index, int]:
-    """Reverse and count the faces of inside-out bodies, but not those of a void in another body."""
+    """Reverse and count the faces of inside-out bodies, but not those of a void."""
     part = connected_parts(faces)
     volume = np.bincount(part, signed_volumes(vertices, faces))
     if (volume >= 0).all():
@@ -342,7 +341,7 @@ def touching_groups(vertices: Array, bodies: list[Index], faces: Index, wall: In
 
 
 def _joined_along_rims(vertices: Array, faces: Index) -> Index:
-    """Return the triangles after division of open edges at the open vertices that lie on them."""
+    """Divide open edges at the open vertices that lie on them."""
     edges = open_edges(faces)
     if not len(edges):
         return faces

@@ -1,7 +1,7 @@
 """The coarser triangles of a mesh that is a flat subdivision.
 
-In a flat subdivision every edge of a coarser mesh was halved without a change of shape. Only the
-coarser triangles then show the curvature.
+There every edge of a coarser mesh was halved without a change of shape, so that only the coarser
+triangles show the curvature.
 """
 
 from dataclasses import dataclass
@@ -42,8 +42,7 @@ class Coarsened:
 def coarsened(vertices: Array, faces: Index) -> Coarsened | None:
     """Return the coarsest triangles that subdivide flatly into these; None if there are none.
 
-    Each connected part is examined separately; its subdivision is undone as a whole or not at all.
-    Neighbours share vertices.
+    Each connected part, with shared vertices, is undone as a whole or not at all.
     """
     coarse: Coarsened | None = None
     for _ in range(MOST_LEVELS):
@@ -85,8 +84,8 @@ def _coarsened_once(vertices: Array, faces: Index) -> Coarsened | None:
 class _Search:
     """Search for the middle triangles of coarser triangles that were divided into four.
 
-    The corners of a middle triangle halve the edges between the tips of its neighbours, the corners
-    of the coarser triangle. The search spreads from one middle triangle across these tips.
+    A middle's corners halve the edges between its neighbours' tips, the corners of the coarser
+    triangle; the search spreads from one middle across these tips.
     """
 
     def __init__(self, vertices: Array, faces: Index, across: Index) -> None:
@@ -95,13 +94,13 @@ class _Search:
         self._corners = Ragged.by_key(faces.ravel(), len(vertices))
 
     def tips(self, middle: Index) -> Index:
-        """Return the tips (m, 3): the vertex of each neighbour that the middle does not share."""
+        """Return tips (m, 3): the vertex of each neighbour that the middle lacks."""
         neighbours, corners = self._faces[self._across[middle]], self._faces[middle]
         shared = (neighbours[:, :, :, None] == corners[:, None, None]).any(axis=3)
         return np.take_along_axis(neighbours, np.argmin(shared, axis=2)[..., None], axis=2)[..., 0]
 
     def middles_of(self, part: Index) -> Index:
-        """Return the middle triangles of a connected part; none if it was not subdivided."""
+        """Return a connected part's middle triangles; none if it was not subdivided."""
         first = part[0]
         starts = [[first], *([face] for face in self._across[first])]
         if len(part) % 4 == 0:
@@ -112,7 +111,7 @@ class _Search:
         return np.zeros(0, np.int64)
 
     def _spread(self, start: Index) -> Index | None:
-        """Return the middle triangles that follow from a first one; None if they contradict."""
+        """Return the middles that follow from a first one; None if they contradict."""
         kind = np.zeros(len(self._faces), np.int8)  # 1: middle triangle, 2: triangle at a tip
         is_tip = np.zeros(len(self._points), bool)
         new, layers = start, []
@@ -133,7 +132,7 @@ class _Search:
         return None if is_tip[self._faces[middles]].any() else middles
 
     def _are_middles(self, faces: Index) -> bool:
-        """Return whether all corners of faces halve the edges between their neighbours' tips."""
+        """Return whether all corners halve the edges between their neighbours' tips."""
         if (faces < 0).any() or (self._across[faces] < 0).any():
             return False
         a, b, c = np.moveaxis(self._points[self.tips(faces)], 1, 0)
@@ -141,12 +140,12 @@ class _Search:
         return bool(np.abs(halves - self._points[self._faces[faces]]).max() <= self._near)
 
     def _beyond(self, tips: Index) -> Index:
-        """Return the faces across the edges that are opposite to the tips."""
+        """Return the faces across the edges opposite to the tips."""
         return np.unique(self._across.ravel()[self._corners.of(tips)[1]])
 
 
 def _across(faces: Index) -> Index:
-    """Return the face (k, 3) across the edge opposite each corner; -1 for none or several."""
+    """Return (k, 3) the face opposite each corner; -1 for none or several."""
     edge, count = edge_use(faces)
     order = np.argsort(edge, kind="stable")
     first = np.cumsum(count) - count

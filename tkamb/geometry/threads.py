@@ -64,7 +64,7 @@ def threads() -> int:
 
 @cache
 def _second() -> tuple[Lock, ThreadPoolExecutor]:
-    """Return a lock that is closed while the second thread works, and the thread's executor."""
+    """The lock is closed while the second thread works."""
     return Lock(), ThreadPoolExecutor(1, "tkamb")
 
 

@@ -34,7 +34,7 @@ def half_edges(faces: Index) -> Index:
 
 
 def edge_use(faces: Index) -> tuple[Index, Index]:
-    """Return the undirected edge (3k,) of every half edge, and each edge's number of faces (m,)."""
+    """Return the undirected edge (3k,) of every half edge, and its faces' number (m,)."""
     ends = np.sort(half_edges(faces), axis=1)
     key = ends[:, 0] * (int(faces.max(initial=0)) + 1) + ends[:, 1]
     _, edge, count = np.unique(key, return_inverse=True, return_counts=True)
@@ -50,9 +50,9 @@ def is_closed(faces: Index) -> bool:
 
 
 def same_places(points: Array) -> tuple[Index, Index]:
-    """Return the first point of each group of equal points (g,), and the group (n,) of every point.
+    """Return the first point (g,) of each group of equal ones, and every point's group (n,).
 
-    Points (n, 3) are grouped by a hash of their bits, or sorted if it is not unique.
+    Groups are by a hash of the bits, or sorted if it is not unique.
     """
     bits = np.ascontiguousarray(points + 0.0).view(np.uint64)  # -0 becomes 0
     mixed = bits * _ODD
@@ -80,8 +80,8 @@ def open_edges(faces: Index) -> Index:
 def boundary_loops(vertices: Array, faces: Index) -> list[BoundaryLoop]:
     """Return the loops of open edges, widest first.
 
-    Two holes that share a vertex are two loops. With inconsistent winding a chain of edges may not
-    close; it is returned as a loop, too.
+    Two holes that share a vertex are two loops. With inconsistent winding a chain that does not
+    close is one, too.
     """
     loops = [_measured(vertices, loop) for loop in _traced(open_edges(faces))]
     return sorted(loops, key=lambda loop: -loop.width)
@@ -180,9 +180,8 @@ class Body:
 def separate_bodies(vertices: Array, faces: Index) -> list[Body]:
     """Return the bodies of a surface, sorted by the area of the outer surface, largest first.
 
-    The normals of a void point into it, so its volume is negative. A closed part is a void of
-    another one if its volume is negative and its bounding box lies within the other's. The faces
-    are repaired (`tkamb.geometry.repair.repair`).
+    A void's normals point into it: a closed part of negative volume is a void of another one if its
+    bounding box lies within that one's. The faces are repaired (`tkamb.geometry.repair.repair`).
     """
     label = connected_parts(faces)
     parts = [np.flatnonzero(label == part) for part in range(int(label.max(initial=-1)) + 1)]

@@ -6,17 +6,17 @@ above the point:
     w = sum of sign(n_y) over the triangles above the point
 
 It is 1 inside a body, 0 outside and in a void, and 2 where two bodies of one file overlap. The two
-sides of a wall between touching bodies change it by -1 and +1, so the wall does not count. The
-parity of the crossings would be wrong for voids with wrong winding, overlaps and walls.
+sides of a wall between touching bodies change it by -1 and +1, so the wall does not count; the
+parity of crossings would be wrong for walls, overlaps and voids with wrong winding.
 
-Positions in the plan view are integers (`PlanGrid`, steps of about 1e-10 m). The signs of the areas
-that decide whether a ray passes through a triangle are therefore exact and consistent at edges and
-vertices. A ray that meets an edge exactly is moved by an infinitesimal distance to +z, and by a
-much smaller one to +x (simulation of simplicity, Edelsbrunner & Muecke, ACM Trans Graph 9:66
-(1990), doi:10.1145/77635.77639). The result is correct for all points off the surface.
+Positions in the plan view are integers (`PlanGrid`, steps of about 1e-10 m), so the signs of areas
+that decide whether a ray passes through a triangle are exact, also at edges and vertices. A ray
+that meets an edge exactly is moved by an infinitesimal distance to +z, and by a much smaller one to
++x (simulation of simplicity, Edelsbrunner & Muecke, ACM Trans Graph 9:66 (1990),
+doi:10.1145/77635.77639). The result is correct for all points off the surface.
 
-In a closed surface the sum over the triangles below, with the opposite sign, is equal. If a ray
-leaves through a small hole of the mesh, the larger sum is the result.
+In a closed surface the sum over the triangles below, with the opposite sign, is equal; if a ray
+leaves through a small hole, the larger sum is the result.
 """
 
 from dataclasses import dataclass
@@ -72,8 +72,8 @@ class PlanGrid:
 class WindingNumber:
     """Winding numbers of points about one surface.
 
-    The triangles of the closed surface are sorted into rectangular buckets of the plan view (x and
-    z). A point is compared only with the triangles in its bucket.
+    The triangles are sorted into rectangular buckets of the plan view (x and z), and a point is
+    compared with those in its bucket only.
     """
 
     def __init__(self, surface: "Surface") -> None:
@@ -85,7 +85,7 @@ class WindingNumber:
 
     @cached_property
     def _buckets(self) -> tuple[Index, Index, Index, Index, Index]:
-        """Lower corner (2,), edge (2,) and number (2,) of the buckets, and their triangles."""
+        """Lower corner (2,), edge (2,) and number (2,), and their triangles."""
         low = self._plan.min(axis=0)
         per_side = int(np.ceil(np.sqrt(min(max(len(self._faces), 1), MAX_BUCKETS))))
         count = np.array([per_side, per_side], np.int64)
@@ -114,7 +114,7 @@ class WindingNumber:
 
 @compiled_as_written
 def _sorted_into_buckets(first: Index, last: Index, count: Index) -> tuple[Index, Index]:
-    """Return the starts (b + 1,) of the buckets in the list of triangles, and this list (m,).
+    """Return the buckets' starts (b + 1,) in the list of triangles, and this list (m,).
 
     `first` and `last` (k, 2) are the lowest and highest bucket of each triangle along x and z.
     """
@@ -138,8 +138,8 @@ def _sorted_into_buckets(first: Index, last: Index, count: Index) -> tuple[Index
 def _signed_area(plan: Index, start: int, end: int, x: int, z: int) -> tuple[int, int]:
     """Return twice the signed area of the triangle of an edge and a point, and a sign.
 
-    The sign of a point on the edge is that after its move (module docstring); 0 only if the edge
-    has no length in the plan view.
+    That of a point on the edge is after its move (module docstring), 0 for an edge without length
+    in the plan view.
     """
     du, dv = plan[end, 1] - plan[start, 1], plan[end, 0] - plan[start, 0]
     area = du * (x - plan[start, 0]) - dv * (z - plan[start, 1])
@@ -162,7 +162,7 @@ def _winding_numbers(
     vertex_plan: Index,
     faces: Index,
 ) -> Index:
-    """Return the winding numbers (n,) of points, see `WindingNumber`.
+    """Return (n,), see `WindingNumber`.
 
     `plan` and `vertex_plan` (·, 2) are x and z as integers; `bucket` is -1 for a point outside all;
     `starts` (b + 1,) are the buckets' first places in the triangles `items` (m,).

@@ -1,9 +1,8 @@
 """Ownership of output folders: a folder is tkamb's own, and one process at a time writes to it.
 
-The file `.tkamb` marks a folder as tkamb's own. A process that writes locks it (filelock). The
-system releases the lock when the process ends for any reason. tkamb uses a folder with foreign
-files only if the user asks for it, and removes only its own files. The files in a folder also show
-which command wrote them. A command does not write into a folder with another command's output.
+The file `.tkamb` marks a folder, and a process that writes locks it (filelock), until it ends for
+any reason. tkamb uses a folder with foreign files only if the user asks for it, and removes only
+its own files. A command does not write into a folder with another command's files.
 """
 
 import os
@@ -41,12 +40,13 @@ WRITTEN = {
 The files of `compare` and `export --vtp` have other names and may be in any folder.
 """
 BESIDE = {"wear": {"run", "uncertainty"}, "run": {"wear"}, "uncertainty": {"wear"}}
-"""Command -> other commands that may write into the same folder. Their file names differ, and the
-page of a run shows its wear."""
+"""Command -> others that may write into the same folder, under other names; a run's page shows its
+wear.
+"""
 
 
 def occupants(folder: Path) -> dict[str, str]:
-    """Return the commands with output in a folder, finished or not, and one file name of each."""
+    """Return the commands with output in a folder, and one file name of each."""
     result = {
         command: name
         for command, names in WRITTEN.items()
@@ -62,7 +62,7 @@ def occupants(folder: Path) -> dict[str, str]:
 
 
 def check_occupants(folder: Path, command: str) -> None:
-    """Raise an InputError if a folder holds the output of a command that may not share it."""
+    """Raise an InputError if another command's output may not share a folder."""
     foreign = {
         other: name
         for other, name in occupants(folder).items()
@@ -74,7 +74,7 @@ def check_occupants(folder: Path, command: str) -> None:
 
 
 def _frames_of(folder: Path) -> tuple[str, str]:
-    """Return the command of a folder's unfinished run ("" without one), and the run's file."""
+    """Return the command of an unfinished run ("" without one), and its file."""
     name = ".frames/run.json"
     content = _object(folder / name)
     if "table of runs" in content:
@@ -85,7 +85,7 @@ def _frames_of(folder: Path) -> tuple[str, str]:
 
 
 def _rows_of(folder: Path) -> tuple[str, str]:
-    """Return the command of a folder's unfinished study ("" without one), and the study's file."""
+    """Return the command of an unfinished study ("" without one), and its file."""
     name = "rows.jsonl"
     try:
         first = read_text(folder / name, TABLE_BYTES).partition("\n")[0]
@@ -144,7 +144,7 @@ def claimed_directory(path: str | Path, force: bool = False, command: str = "") 
 
 
 def settle(folder: Path) -> None:
-    """Complete a killed process's file changes in a folder of tkamb's."""
+    """Complete a killed process's file changes in tkamb's folder."""
     if replacement_pending(folder):
         with claimed_directory(folder):
             pass
@@ -152,7 +152,7 @@ def settle(folder: Path) -> None:
 
 @contextmanager
 def _holding(lock: FileLock, path: Path) -> Iterator[None]:
-    """Lock a folder's marker while the block runs; the marker is made if it does not exist."""
+    """The marker is made if it does not exist."""
     marker = path / MARKER
     with suppress(FileNotFoundError):
         status = marker.lstat()
@@ -189,8 +189,8 @@ def _check_ours(path: Path, force: bool) -> None:
 def is_ours(path: Path) -> bool:
     """Return whether a folder holds tkamb's marker file or its output.
 
-    Releases without the marker are recognised by a summary.json with tkamb's version, by the file
-    of an unfinished run, or by the rows of a study.
+    Without the marker, a summary.json with tkamb's version, an unfinished run's file or a study's
+    rows show it.
     """
     if os.path.lexists(path / MARKER):
         return True
@@ -203,14 +203,15 @@ def is_ours(path: Path) -> bool:
 OWN_MARK = b"tkamb"
 """Mark near the beginning of every page, map and deck that tkamb writes."""
 MARK_WITHIN = 4096
-"""Number of bytes at the beginning of a file that are searched for the mark."""
+"""Bytes at the beginning of a file that are searched for the mark."""
 PICTURES = {".png": (0, b"\x89PNG"), ".gif": (0, b"GIF8"), ".mp4": (4, b"ftyp")}
-"""Suffix of a picture or film -> (offset, bytes) that identify its format. Pictures and films have
-no mark of tkamb. One may therefore replace any other of its format."""
+"""Suffix of a picture or film -> (offset, bytes) of its format. These have no mark of tkamb, so one
+may replace any other of its format.
+"""
 
 
 def check_output_file(path: str | Path | None, force: bool = False) -> None:
-    """Raise an InputError if writing an output file would replace a file that tkamb did not write.
+    """Raise an InputError if an output file would replace one that tkamb did not write.
 
     Args:
         path: the output file; None: no file is written.
@@ -236,7 +237,7 @@ def check_output_file(path: str | Path | None, force: bool = False) -> None:
 
 
 def _object(path: Path) -> dict[str, Any]:
-    """Return the object in a JSON file, or {} if the file is unreadable or holds no object."""
+    """Return {} for an unreadable file, or one without an object."""
     try:
         content = read_json(path)
     except InputError:

@@ -40,10 +40,10 @@ EXAMPLE = "see docs/materials.md"
 def given_material(table: Mapping[str, Any], where: object = "[material]") -> Material:
     """Return the material that a table with the keys `KEYS` describes.
 
-    A table with only `base` is that built-in material. Further keys replace the base's values.
-    Without `base`, the table needs Young's modulus, Poisson's ratio and the numbers of its law.
-    Young's modulus of a tabulated curve is its slope at the origin. If the table also gives
-    `young_modulus_MPa`, the curve is scaled to that value.
+    With only `base` it is that built-in material, whose values further keys replace. Without
+    `base`, it needs Young's modulus, Poisson's ratio and the numbers of its law. Young's modulus of
+    a tabulated curve is its slope at the origin, to which `young_modulus_MPa` scales the curve if
+    given.
 
     Args:
         table: keys of docs/materials.md; a key with value None is ignored.

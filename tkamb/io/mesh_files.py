@@ -1,7 +1,7 @@
 """Files from meshes: VTK XML for ParaView, the lattice of an insert, one of several bodies.
 
-Arrays are in base64, little-endian and uncompressed. The length of an array in bytes (UInt64)
-precedes it. Coordinates are in metres.
+Arrays are in base64, little-endian and uncompressed, after their length in bytes (UInt64), and
+coordinates in metres.
 """
 
 import base64
@@ -84,12 +84,7 @@ def write_triangles(
 def write_map_series(maps: "ContactMaps", folder: Path, stem: str = "contact") -> list[str]:
     """Write the maps of a run for ParaView: a .vtp for each frame, and a .pvd with all times.
 
-    A failed frame has no map (NaN) and gets no file.
-
-    Args:
-        maps: maps of the insert or of the button.
-        folder: folder of the files.
-        stem: beginning of the files' names.
+    A failed frame has no map and no file.
 
     Returns:
         The names of the files, the .pvd first.
@@ -151,12 +146,9 @@ BODY_FORMATS = (".stl", ".ply", ".obj")
 
 @dataclass(frozen=True, eq=False)
 class LatticeReport:
-    """A lattice, its quality and its file.
-
-    Args:
-        lattice: the lattice in the insert frame.
-        out: path of the .vtu file; None: no file is written.
-        side: side of the knee; the lattice of a left insert is mirrored.
+    """Args:
+    out: path of the .vtu file; None: no file is written.
+    side: side of the knee; the lattice of a left insert is mirrored.
     """
 
     lattice: Lattice

@@ -1,4 +1,4 @@
-"""Presets: named choices of a study. `tkamb run SCENE --as NAME` applies them to a scene.
+"""Presets: named choices of a study, which `tkamb run SCENE --as NAME` applies to a scene.
 
 `BUILT_IN` lists the built-in presets. Another package can offer a preset through the entry-point
 group `tkamb.io.presets`:
@@ -26,7 +26,7 @@ class Change:
     """A key of the scene whose value a preset has changed.
 
     Args:
-        before: value in the scene; None: the key is absent, so that the default applies.
+        before: value in the scene; None: absent, so that the default applies.
         after: value of the preset; None: the table is left out.
     """
 
@@ -37,10 +37,9 @@ class Change:
 
 @dataclass(frozen=True)
 class AppliedPreset:
-    """The result of applying a preset to a scene.
+    """The result of applying a preset.
 
     Args:
-        name: name of the preset, as in `--as`.
         changes: keys that had another value in the scene.
         overridden: keys of the preset that `--set` or another option overrides.
         departures: remaining differences between the scene and the study, in words.
@@ -87,7 +86,7 @@ def _words(value: Any, none: str) -> str:
 
 
 class Preset:
-    """The choices of a study. A subclass is one preset; `BUILT_IN` or an entry point names it.
+    """The choices of a study; a subclass that `BUILT_IN` or an entry point names.
 
     Attributes:
         name: name of the preset, as in `--as`.
@@ -174,8 +173,7 @@ def _put(content: dict[str, Any], dotted: str, value: Any) -> None:
 class Sharma2008(Preset):
     """Sharma, dissertation, University of Tennessee, Knoxville (2008), chapter 4.
 
-    The preset sets each choice that a key of the scene can express. Comments name the section of
-    the study.
+    The preset sets each choice that a key can express; comments name the section.
     """
 
     name: ClassVar[str] = "sharma-2008"
@@ -231,7 +229,7 @@ class Sharma2008(Preset):
         )
 
     def departures(self, content: Mapping[str, Any]) -> tuple[str, ...]:
-        """Return the remaining differences between a scene and the study, in words."""
+        """Return the remaining differences from the study, in words."""
         result = []
         kind = content["tibia"].get("kind")
         if kind != "sagittal":

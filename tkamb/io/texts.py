@@ -1,6 +1,6 @@
 """Templates: sentences as plain text, and HTML pages.
 
-Templates are in the folder `assets` of each package. They state the words, and Python the facts.
+They are in the folder `assets` of each package and state the words, Python the facts.
 """
 
 import re
@@ -15,8 +15,6 @@ def environment(package: str, html: bool, strict: bool = True) -> Environment:
     """Return the environment of a package's templates.
 
     Args:
-        package: package of the templates, for example "tkamb.run".
-        html: whether values are escaped.
         strict: whether a missing value raises an error. Otherwise it is empty and false.
     """
     result = Environment(
@@ -36,12 +34,7 @@ def environment(package: str, html: bool, strict: bool = True) -> Environment:
 
 
 def lines(package: str, name: str, *, strict: bool = True, **facts: Any) -> list[str]:
-    """Return the lines of text that a template makes from facts, without empty ones.
-
-    Args:
-        package: package of the template, for example "tkamb.run".
-        strict: whether a missing value raises an error. Otherwise it is empty and false.
-    """
+    """Return the lines of text that a template makes from facts, without empty ones."""
     return nonempty(environment(package, False, strict).get_template(name).render(facts))
 
 

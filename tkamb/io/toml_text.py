@@ -1,8 +1,8 @@
 """Reading of users' TOML within limits, and writing of values as TOML text.
 
-A small text must not take hours or gigabytes to read. The time of Python's reader grows with the
-square of the number of parts of a dotted key, and its memory with nesting. It also fails at
-integers of thousands of digits. tkamb therefore checks all three before it reads a text.
+A small text must not take hours or gigabytes: the time of Python's reader grows with the square of
+a dotted key's parts, its memory with nesting, and it fails at integers of thousands of digits.
+tkamb checks all three first.
 """
 
 import json
@@ -23,16 +23,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TomlLimits:
-    """Limits of a TOML text. Scenes, cohorts and materials stay far below them."""
+    """Limits of a TOML text, far above scenes, cohorts and materials."""
 
     size: int = 8 * MEGABYTE
-    """bytes: largest size of a file. Python's reader takes ten seconds for it."""
+    """bytes: largest file, for which Python's reader takes ten seconds."""
     key_parts: int = 16
-    """Largest number of parts of a dotted key or of a table's name. A scene needs four."""
+    """Largest number of parts of a dotted key or a table's name; a scene needs four."""
     digits: int = 100
     """Largest number of successive digits in a number."""
     depth: int = 32
-    """Largest depth of nested lists and inline tables. A scene needs four."""
+    """Largest depth of nested lists and inline tables; a scene needs four."""
 
 
 LIMITS = TomlLimits()
@@ -83,10 +83,8 @@ def check_limits(text: str, where: object) -> None:
 
 
 def toml_value(value: Any, decimals: int | None = None) -> str:
-    """Return a text, path, number, list, array or inline table as TOML.
-
-    Args:
-        decimals: number of decimals of floating-point numbers; None: all that they need.
+    """Return a value as TOML: text, path, list, array, inline table, or number (None: all decimals
+    needed).
     """
     if hasattr(value, "tolist"):  # an array or number of NumPy, which is not imported here:
         value = value.tolist()  # `main` sets the threads of BLAS before NumPy is loaded
@@ -106,7 +104,7 @@ def toml_value(value: Any, decimals: int | None = None) -> str:
 
 
 def table_lines(name: str, values: Mapping[str, Any]) -> list[str]:
-    """Return the lines of one table of a scene, with an empty line at its end."""
+    """Return a table's lines, with an empty one at its end."""
     return [name, *(f"{key} = {toml_value(value)}" for key, value in values.items()), ""]
 
 
@@ -116,11 +114,11 @@ def toml_mm(point: "Array") -> str:
 
 
 def toml_key(label: str, whole: bool = False) -> str:
-    """Return a marker's label as a TOML key. The key has the label's prefix if `whole`."""
+    """Return a marker's label as a TOML key, with its prefix if `whole`."""
     plain = label if whole else label.rpartition(":")[2]
     return plain if re.fullmatch(r"[A-Za-z0-9_-]+", plain) else toml_value(plain)
 
 
 def toml_markers(points: Mapping[str, "Array"], whole: bool = False) -> str:
-    """Return an inline table of marker positions, mm. Keys have the labels' prefixes if `whole`."""
+    """Return marker positions, mm, as an inline table, with prefixes if `whole`."""
     return toml_value({toml_key(k, whole): p / MILLIMETRE for k, p in points.items()}, 3)

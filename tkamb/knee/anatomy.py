@@ -1,8 +1,8 @@
 """Finds the knee in a Pinocchio model: its frames, its joints, and the bodies of the shank.
 
 The shank is every body on the tibia's side of the knee, including the foot; the thigh the body to
-which the frame "femur" is fixed. The pelvis acts on it by the load at the hip. The same equations
-therefore hold for a leg that stands on its foot, one that hangs from a pelvis, and a whole body.
+which the frame "femur" is fixed. The pelvis acts on it by the load at the hip, so that the same
+equations hold for a leg that stands on its foot, one that hangs from a pelvis, and a whole body.
 """
 
 from collections.abc import Mapping, Sequence
@@ -72,13 +72,13 @@ class Anatomy:
 
     @cached_property
     def patella_q(self) -> frozenset[int]:
-        """Indices in q of the joints between femur and patella."""
+        """Indices in q of the patella's joints."""
         joints = self._patella_joints
         return frozenset(k for one in joints for k in range(one.idx_q, one.idx_q + one.nq))
 
     @cached_property
     def patella_v(self) -> frozenset[int]:
-        """Indices in v of the joints between femur and patella."""
+        """Indices in v of the patella's joints."""
         joints = self._patella_joints
         return frozenset(k for one in joints for k in range(one.idx_v, one.idx_v + one.nv))
 
@@ -174,9 +174,8 @@ def find_anatomy(
 
 
 def _offers(model: pin.Model, part: str) -> bool:
-    """Return whether the model has a frame with the name of a part.
-
-    Frames of joints do not count: a joint "hip" need not lie in the hip centre.
+    """Return whether the model has a frame with the name of a part. Frames of joints do not count:
+    a joint "hip" need not lie in the hip centre.
     """
     return any(f.name == part and f.type != pin.FrameType.JOINT for f in model.frames)
 
@@ -191,7 +190,7 @@ def _missing(model: pin.Model, part: str) -> InputError:
 
 
 def _frame(model: pin.Model, name: str, part: str | None = None) -> FixedFrame:
-    """Return the frame with a name; of several frames with this name, the frame of a body."""
+    """Return the frame with a name, preferably of a body."""
     must_be(name, str, "frames", "give names of frames of the model")
     if not model.existFrame(name):
         names = [frame.name for frame in model.frames]
@@ -206,7 +205,7 @@ def _frame(model: pin.Model, name: str, part: str | None = None) -> FixedFrame:
 
 
 def _joint_placement(model: pin.Model, name: str, base: FixedFrame) -> FixedFrame | None:
-    """Return the placement of a joint on the body of a frame; None if it is on another body."""
+    """Return the placement of a joint on a frame's body; None on another one."""
     if not model.existJointName(name):
         return None
     joint = model.getJointId(name)
@@ -241,10 +240,10 @@ def _check_joints(model: pin.Model, joints: Sequence[str], path: tuple[int, ...]
 def _shank(
     model: pin.Model, tibia: int, femur: int, path: tuple[int, ...], patella: FixedFrame | None
 ) -> tuple[int, ...]:
-    """Return the joints of all bodies that remain connected to the tibia if the knee is cut.
+    """Return the joints of all bodies that stay connected to the tibia if the knee is cut.
 
-    A body between femur and tibia belongs to the shank. Bodies attached to the femur, the patella
-    or the universe do not.
+    A body between femur and tibia belongs to the shank, those attached to femur, patella or
+    universe do not.
     """
     shank = {tibia, *path} - {femur}
     excluded = {0, femur} | (set() if patella is None else {patella.joint})
@@ -271,9 +270,8 @@ LEAST_LEVER = 0.05
 
 
 def check_not_exchanged(anatomy: Anatomy) -> None:
-    """Raise an InputError if the masses say that femur and tibia are exchanged.
-
-    Then the femur's centre of mass lies below the knee, and the tibia's above it.
+    """Raise an InputError if femur and tibia are exchanged: the femur's centre of mass lies below
+    the knee, the tibia's above it.
     """
     levers = [_centre_height(anatomy.model, frame) for frame in (anatomy.femoral, anatomy.insert)]
     if -levers[0] > LEAST_LEVER and levers[1] > LEAST_LEVER:
@@ -286,7 +284,7 @@ def check_not_exchanged(anatomy: Anatomy) -> None:
 
 
 def _centre_height(model: pin.Model, frame: FixedFrame) -> float:
-    """Return the height of a body's centre of mass, along y of a frame on it, m; 0 without mass."""
+    """Return the height of a body's centre of mass along a frame's y, m; 0 without mass."""
     inertia = model.inertias[frame.joint]
     if not frame.joint or not inertia.mass > 0.0:
         return 0.0

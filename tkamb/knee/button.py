@@ -14,8 +14,8 @@ bounding rectangle.
 The equations of the knee give the patellofemoral force F along the contact normal n, from femur to
 patella, and the pose of the patella. The button is pressed along its axis y_b at this pose, until
 the contact carries the axial part of the force, -F (n . y_b). The contact is frictionless. Its
-force across the axis follows from the shape of the surfaces; in equilibrium it is that of F n. The
-sagittal difference of the two forces is a result (`ButtonPress.imbalance`), as a residual is.
+force across the axis follows from the surfaces, and the sagittal difference to F n is a result
+(`ButtonPress.imbalance`), as a residual is.
 
 Medial and lateral facet are the parts of the contact on the two sides of the patella's sagittal
 plane, in the femoral frame.
@@ -95,7 +95,7 @@ class ButtonPress:
 
     @property
     def facets(self) -> dict[str, CondyleContact | None]:
-        """Side -> contact of that facet; None: the facet is unloaded. Empty without contact."""
+        """Side -> contact of that facet, None if it is unloaded; empty without contact."""
         if self.contact is None:
             return {}
         return {"medial": self.contact.medial, "lateral": self.contact.lateral}
@@ -104,7 +104,7 @@ class ButtonPress:
     def on_patella(self) -> Array:
         """(6,) force (N) and moment about the insert's origin (N·m) on the patella, insert frame.
 
-        The wrench on the femur is opposite. NaN without contact.
+        The femur's is opposite; NaN without contact.
         """
         if self.contact is None:
             return np.full(6, np.nan)
@@ -178,10 +178,7 @@ class Button:
         return replace(press, flags=self.flags(press), seconds=clock.perf_counter() - began)
 
     def flags(self, press: ButtonPress) -> tuple[str, ...]:
-        """Return the flags of a press with a contact: those of its model, and those of a button.
-
-        The latter are an unloaded facet, an edge of the femoral component, and imbalance.
-        """
+        """Return the model's flags, and a button's: unloaded facet, femoral edge, imbalance."""
         assert press.contact is not None
         return (*map(_of_button, press.contact.flags), *self._flags(press))
 
@@ -216,7 +213,7 @@ class Button:
 
     @cached_property
     def _edges(self) -> cKDTree | None:
-        """Points on the sharp and open edges of the femoral component; None: it has none."""
+        """Points on the component's sharp and open edges; None: it has none."""
         femoral = self.pair.femoral
         face, corner = np.nonzero(sharp_edges(femoral))
         if not len(face):
@@ -249,9 +246,8 @@ def button_in_patella(button: Surface) -> Array:
 def without_pegs(body: Surface) -> Surface:
     """Return a button in the button frame without the parts below its flat back.
 
-    Pegs are cemented into the bone, so that they do not deform. Their points move up to y = 0: the
-    end of a peg closes the back, and its wall, which has no area there, is removed. A peg that
-    grows wider towards its end would cover the back twice; its faces cancel.
+    Pegs are cemented into the bone and do not deform. The end of a peg moves up to y = 0 and closes
+    the back; its wall, which has no area there, is removed.
     """
     if body.bounds[0, 1] > -PEG:
         return body
@@ -262,7 +258,7 @@ def without_pegs(body: Surface) -> Surface:
 
 
 def _of_button(words: str) -> str:
-    """Return a message of a contact model with the names of the button's parts."""
+    """Replace a contact model's names by those of the button's parts."""
     for ours, theirs in (("insert", "button"), ("condyle", "facet")):
         words = words.replace(ours, theirs)
     return f"button: {words}"

@@ -124,12 +124,12 @@ class Chain:
 
     @property
     def insert_in_tibia(self) -> Array:
-        """The pose of the insert in the tibia, pose_insert_in_tibia (4, 4)."""
+        """pose_insert_in_tibia (4, 4)."""
         return inverse(self._tibia_in_root) @ self._insert_in_root
 
     @property
     def patella_joint_in_femur(self) -> Array:
-        """The pose (4, 4) of the patella's joint in the femur."""
+        """pose_joint_in_femur (4, 4)."""
         # The patella moves in the x-y plane of this joint.
         return self.model.jointPlacements[self.model.getJointId(PATELLA_JOINT_NAMES[0])].homogeneous
 
@@ -168,7 +168,7 @@ class Chain:
         return self._columns[:6]
 
     def patella_columns(self) -> list[int]:
-        """Return the rows of the three patella coordinates; empty: a patella fixed to the femur."""
+        """Return the rows of the three patella coordinates; empty if it is fixed."""
         return self._columns[6:]
 
     def at(self, motion: ChainMotion) -> "ChainState":
@@ -194,7 +194,7 @@ class Chain:
 
 
 class ChainState:
-    """The chain at one instant. Poses and loads are in the insert frame.
+    """The chain at one instant; poses and loads are in the insert frame.
 
     Attributes:
         inertial: RNEA(q, v, a), (nv,): generalised forces that all loads must add up to.
@@ -213,7 +213,7 @@ class ChainState:
 
     @cached_property
     def laboratory_in_insert(self) -> Array:
-        """The pose of the laboratory in the insert, pose_laboratory_in_insert (4, 4)."""
+        """pose_laboratory_in_insert (4, 4)."""
         return inverse(self.insert_in_laboratory)
 
     def pose(self, link: str) -> Array:
@@ -246,7 +246,7 @@ class ChainState:
         self.inertial = self.inertial + self._jacobian(link).T @ wrench
 
     def _jacobian(self, link: str) -> Array:
-        """Return a link's Jacobian (6, nv) at the insert's origin, in the insert's axes."""
+        """Return (6, nv) at the insert's origin, in its axes."""
         joint = self.chain.model.frames[self.chain.frame_id(link)].parentJoint
         if joint not in self._jacobians:
             model, data = self.chain.model, self.data

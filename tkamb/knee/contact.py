@@ -77,11 +77,11 @@ class KneeContact:
         return KneeContact(self.model, self.pair.of_material(stiffer), friction)
 
     def probe(self, start: Guess | None = None) -> Any:
-        """Return a new probe (`tkamb.contact.model.Probe`). The caller reuses it as warm start."""
+        """Return a new probe (`tkamb.contact.model.Probe`); the caller reuses it as warm start."""
         return self.model.probe(self.state, start)
 
     def precise_probe(self, start: Guess | None = None) -> Any:
-        """Return a new probe that is precise enough for finite differences."""
+        """Return a probe that is precise enough for finite differences."""
         names = {field.name for field in fields(self.model)}  # type: ignore[arg-type]
         if "tolerance" not in names:
             return self.probe(start)
@@ -102,7 +102,7 @@ class KneeContact:
         return contact
 
     def with_exact_tangent(self, probe: Any, contact: ProbedContact) -> ProbedContact:
-        """Return a contact of a probe with the model's exact tangent, if it has one."""
+        """Return a contact with the model's exact tangent, if it has one."""
         # A probe of another package needs no such method.
         tangent = getattr(probe, "exact_tangent", None)
         return contact if tangent is None else tangent(contact)

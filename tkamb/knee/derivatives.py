@@ -127,9 +127,9 @@ def forces_and_derivatives(
 def relative_twists(
     knee: "Knee", q: Array, data: "KneeData", loads_patella: bool
 ) -> RelativeTwists:
-    """Return the twists of femur and patella at q, and update `data`.
+    """Update `data`, return the twists at q.
 
-    Those of a patella without a load are not computed.
+    Those of an unloaded patella are not computed.
     """
     femur, bridge, anatomy = knee.relative_jacobian(q, data), knee.bridge, knee.anatomy
     if anatomy.patella is None or knee.extensor is None or not loads_patella:
@@ -151,12 +151,12 @@ def relative_twists(
 
 
 def _users(knee: "Knee", columns: Array) -> Array:
-    """Return twists or wrenches (6, ...) of a right knee as those of the user's knee, or back."""
+    """Mirror twists or wrenches (6, ...) between a right knee and the user's."""
     return mirrored_spatial(columns.T).T if knee.left else columns
 
 
 def _relative_jacobian(model: Any, data: Any, follower: FixedFrame, base: FixedFrame) -> Array:
-    """Return the twist (6, nv) of one body relative to another, at the origin of `base`."""
+    """Return one body's twist (6, nv) relative to another, at the origin of `base`."""
     placement, total = data.oMi[base.joint] * base.placement, np.zeros((6, model.nv))
     for frame, sign in ((follower, 1.0), (base, -1.0)):
         if frame.joint:
@@ -174,9 +174,8 @@ def _between(
     q: Array,
     v: Array,
 ) -> tuple[dict[str, Array], dict[str, Array], dict[str, Array]]:
-    """Return link -> wrench (6,), its derivative (6, nv) by q, and by v, of contact and ligaments.
-
-    The ligaments are those between femur and tibia. All values are those of a right knee.
+    """Return link -> wrench (6,), derivatives (6, nv) by q and by v, of a right knee's contact and
+    femorotibial ligaments.
     """
     on_insert, by_q = np.zeros(6), np.zeros((6, knee.model.nv))
     by_v, femur = np.zeros_like(by_q), _users(knee, twists.femur)
@@ -209,7 +208,8 @@ def _between(
 def twist_derivative(knee: "Knee", data: Any, femur: Array, q: Array, v: Array) -> Array:
     """Return the derivative (6, nv) of the femur's twist relative to the insert by q, at v.
 
-    The twist is in the insert frame of the user's knee; `femur` is it per joint velocity, (6, nv).
+    It is in the insert frame of the user's knee, as is `femur`, the twist per joint velocity, (6,
+    nv).
     """
     model, bridge = knee.model, knee.bridge
     if len(model.mimicking_joints):
@@ -233,7 +233,7 @@ def twist_derivative(knee: "Knee", data: Any, femur: Array, q: Array, v: Array) 
 
 
 def _twist_differences(knee: "Knee", q: Array, v: Array) -> Array:
-    """Return the result of `twist_derivative` by central differences of J(q) v."""
+    """Return `twist_derivative` by central differences of J(q) v."""
     model, step = knee.model, JOINT_STEP
     columns = []
     for direction in step * np.eye(model.nv):
@@ -255,9 +255,8 @@ def _beside(
     tensions: Mapping[str, float],
     twists: RelativeTwists,
 ) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Return link -> wrench (6,), and its derivative (6, nv), of the loads beside the contact.
-
-    These are the extensor mechanism and the ligaments that end on the patella.
+    """Return link -> wrench (6,), and derivative (6, nv), of extensor mechanism and ligaments that
+    end on the patella.
     """
     if not knee._loads_patella(tensions):
         return {}, {}
@@ -356,22 +355,22 @@ def _patella_slopes(knee: "Knee", kinematics: KneePose, patella: "PatellaState")
 
 
 def _pose_differences(values: Callable[[Array], Array], pose: Array) -> Array:
-    """Return the derivative (n, 6) of values (n,) by a displacement of the femur."""
+    """Return the derivative (n, 6) by a displacement of the femur."""
     sizes = np.repeat([1.0, 1.0 / FORCE_DERIVATIVE_ARM], 3)
     return _edge_free(lambda move: values(displaced(pose, move)), sizes, POSE_STEP)
 
 
 def _patella_differences(values: Callable[[Array], Array], coordinates: Array) -> Array:
-    """Return the derivative (n, 3) of values (n,) by the patella's coordinates."""
+    """Return the derivative (n, 3) by the patella's coordinates."""
     sizes = np.array([1.0, 1.0, 1.0 / FORCE_DERIVATIVE_ARM])
     return _edge_free(lambda move: values(coordinates + move), sizes, PATELLA_STEP)
 
 
 def _edge_free(values: Callable[[Array], Array], sizes: Array, step: float) -> Array:
-    """Return the derivative (n, k) of values (n,) by k coordinates, by central differences.
+    """Return the derivative (n, k) by k coordinates, by central differences.
 
-    If the two one-sided differences of a coordinate differ by more than `EDGE`, an edge of a facet
-    lies within the step: a tenth of the step is tried, then a hundredth.
+    If the two one-sided differences differ by more than `EDGE`, an edge of a facet lies within the
+    step: a tenth of it is tried, then a hundredth.
     """
     here, columns = values(np.zeros(len(sizes))), []
     for k, size in enumerate(sizes):

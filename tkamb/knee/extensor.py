@@ -53,8 +53,7 @@ class Posed(Protocol):
 class ExtensorLines:
     """Muscle, patella and patellar ligament of a knee, at any pose of the femur.
 
-    `mechanism` is the input of the search for the patella. Objects with the same surfaces share the
-    `prepared` patellofemoral contact.
+    Objects with the same surfaces share the `prepared` patellofemoral contact.
     """
 
     def __init__(self, parts: ExtensorParts) -> None:
@@ -69,7 +68,7 @@ class ExtensorLines:
     ) -> PatellaState:
         """Return the patella at given coordinates (3,) with the femur at a pose (4, 4).
 
-        Without a `contact` at these coordinates (m and rad) it is computed.
+        Without a `contact` there (m and rad) it is computed.
         """
         contact = self.mechanism.contact.at(coordinates) if contact is None else contact
         return patella_at(self.mechanism, pose, coordinates, contact)
@@ -80,7 +79,7 @@ class ExtensorLines:
         """Return the patella in equilibrium.
 
         `guess` is the patella at a similar pose, or else `near` its coordinates (3,), m and rad, as
-        initial guess. Without either the search covers all rotations.
+        initial guess. Without either, all rotations are searched.
         """
         if guess is None or not guess.status.found:
             return solve_patella(self.mechanism, pose, near)
@@ -259,9 +258,9 @@ class ExtensorFrames:
         """Return the patella for slightly changed lines or poses of the femur.
 
         In the given frames the equilibrium is solved again, from the last one. A solved patella
-        moves there. A recorded patella moves from `recorded` (f, 3), possibly changed coordinates,
-        by the change of the equilibrium: its distance from it stays. It is lost if one of the two
-        equilibria does not exist. The rates and all other frames do not change.
+        moves there; a recorded one moves from `recorded` (f, 3), possibly changed coordinates, by
+        the change of the equilibrium, and is lost if one of the two equilibria does not exist. The
+        rates and all other frames do not change.
         """
         other = copy.copy(self)
         other.lines, other._joints = lines, self._joints.copy()
@@ -311,8 +310,8 @@ class ExtensorFrames:
     def patella(self, k: int, pose: Array, guess: PatellaState | None = None) -> PatellaState:
         """Return the patella of frame k with the femur at another pose (4, 4).
 
-        A recorded patella keeps its coordinates. A solved one is solved again, from `guess` or the
-        patella at the recorded pose.
+        A recorded patella keeps its coordinates; a solved one is solved again, from `guess` or the
+        recorded pose.
         """
         mechanism = self.lines.mechanism
         frame_state = self.states[k]
@@ -384,9 +383,9 @@ class PatellaOfFrame:
 
 @lru_cache(maxsize=1)
 def _patellar_contact(femoral: Surface, button: Surface, joint: bytes) -> PatellofemoralContact:
-    """Return the prepared contact of two surfaces, cached by their identity for a scene's samples.
+    """Return the prepared contact, cached by the surfaces' identity for a scene's samples.
 
-    The surfaces are in the frames of the links; `joint` are bytes of pose_joint_in_femur (4, 4).
+    They are in the frames of the links; `joint` are bytes of pose_joint_in_femur (4, 4).
     """
     joint_in_femur = np.frombuffer(joint).reshape(4, 4)
     return PatellofemoralContact(femoral.moved(inverse(joint_in_femur)), button)
@@ -410,7 +409,7 @@ class _RecordedContacts:
 
 @lru_cache(maxsize=1)
 def _recorded_contacts(prepared: PatellofemoralContact, coordinates: bytes) -> _RecordedContacts:
-    """Return the contacts at recorded coordinates (bytes), which do not depend on the knee's pose.
+    """Return the contacts at recorded coordinates (bytes), whatever the knee's pose.
 
     The cache compares the identity of the prepared contact.
     """
@@ -418,9 +417,9 @@ def _recorded_contacts(prepared: PatellofemoralContact, coordinates: bytes) -> _
 
 
 class _RecordedStates(Sequence[PatellaState]):
-    """The recorded patella at the recorded poses of the femur (f, 4, 4).
+    """The recorded patella at recorded poses of the femur (f, 4, 4).
 
-    `lost` has the states of the frames in which a sample has no patella.
+    `lost` has the states of frames without a patella.
     """
 
     def __init__(
@@ -472,5 +471,5 @@ class _Poses:
 
 
 def _on_tibia(load: PointForces) -> PointForces:
-    """Return a load with the link "insert" replaced by "tibia". The two are fixed to each other."""
+    """Replace the link "insert" by "tibia", to which it is fixed."""
     return replace(load, link="tibia") if load.link == "insert" else load

@@ -44,8 +44,9 @@ _FINE = (
 _FINE_WEIGHTS = _WEIGHTS / RUNGE_KUTTA_STEPS
 _NODES, _COARSE_WEIGHTS = np.polynomial.legendre.leggauss(6)
 _COARSE, _ENDS = _NODES, np.array([-1.0, 1.0])
-"""Parameters -1 to 1 of points on an arc: Gauss points of the whole arc, and the ends. `_FINE`
-contains the Gauss points of each Runge-Kutta step."""
+"""Parameters -1 to 1 on an arc: Gauss points of the whole arc, and the ends; `_FINE`: Gauss points
+of each Runge-Kutta step.
+"""
 
 
 def planar_starts(
@@ -184,7 +185,6 @@ class Strings:
             `exit`.
         arc_m: lengths on the ellipsoid, m, (f,).
         length_m: whole lengths, m, (f,).
-        converged: mask of the taut strings, for which the iteration has converged, (f,).
     """
 
     entry: Array
@@ -201,10 +201,8 @@ def shortest_strings(start: Array, end: Array, axes: Array, half: Array | None =
         start: points outside the ellipsoid, m, (f, 3), like `end`; the segment between them
             passes through the ellipsoid.
         axes: semi-axes, m, (3,).
-        half: direction of the half on which the string must touch, (3,); None: either half.
-
-    Returns:
-        The strings. If there is no taut string on the half, `converged` is False.
+        half: direction of the half on which the string must touch, (3,); None: either half. Without
+            a taut string on it `converged` is False.
     """
     count = len(start)
     contour, pieces, rival = planar_starts(start / axes, end / axes, axes, half)
@@ -228,9 +226,9 @@ def shortest_strings(start: Array, end: Array, axes: Array, half: Array | None =
 
 
 def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) -> Strings:
-    """Return the strings that Newton's method finds from initial guesses.
+    """Return the strings that Newton's method finds.
 
-    Starts and ends (f, 3), m. `contour` (f, 3) are initial points on the contour, with the
+    Starts and ends are (f, 3), m. `contour` (f, 3) are initial points on the contour, with the
     ellipsoid scaled to the unit sphere, `pieces` (f, s), m, initial lengths of steps along the
     geodesic.
     """
@@ -279,7 +277,7 @@ def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) 
 
 @dataclass(frozen=True, eq=False)
 class _Shot:
-    """Geodesics from the contour of `start`, to measure their direction errors at `end`."""
+    """Geodesics from the contour of `start`, which measure direction errors at `end`."""
 
     start: Array
     end: Array
@@ -348,8 +346,8 @@ def _follow_geodesics(
     Args:
         states: (x, v, j, j') at the starts, replaced by the values at the ends, (f, 8).
         pieces: lengths of the steps, m, (f, s).
-        weights: weights of the earlier stages in each of the k stages, (k, k).
-        last_weights: weights of the stages in a step, (k,).
+        weights: weights of the earlier stages in each of the k stages, (k, k). Those of the stages
+            in a step are `last_weights` (k,).
     """
     count = len(last_weights)
     stages, point, gradient = np.empty((count, 8)), np.empty(8), np.empty(3)

@@ -143,9 +143,9 @@ def implicit_step(
 def _rotation_stiffness(knee: Knee, forces: Any, data: KneeData) -> Array:
     """Return the stiffness (6, 6) due to the rotation of the femur, insert frame.
 
-    The derivatives of `pin.aba` hold a force constant in the joint's frame. The knee's force w on
-    the femur is constant in the insert frame instead, so that a displacement xi of the femur
-    changes it by -xi x* w in the femur's frame.
+    The derivatives of `pin.aba` hold a force constant in the joint's frame, but the knee's force w
+    on the femur is constant in the insert frame, so that a displacement xi of the femur changes it
+    by -xi x* w in the femur's.
     """
     bridge, placements = knee.bridge, data.data.oMi
     insert = placements[bridge.insert.joint] * bridge.insert.placement

@@ -5,8 +5,8 @@ tension, constant along the path without friction. The wrench on a link is -T dL
 displacement x: the tension pulls along the straight parts at their ends and presses on a surface
 where the path meets and leaves it. The sum of all wrenches is zero.
 
-If an end of the path moves into an ellipsoid, the ellipsoid shrinks with this end, so that L is
-continuous. There is no path if an end lies inside a cylinder, a sphere or a section.
+If an end of the path moves into an ellipsoid, this shrinks, so that L is continuous; inside a
+cylinder, a sphere or a section there is no path.
 """
 
 from collections.abc import Mapping, Sequence

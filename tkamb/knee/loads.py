@@ -120,15 +120,7 @@ class KneeLoads:
 def knee_loads(
     geometry: KneeGeometry, solved: SolvedLoads, friction: float, bridge: Bridge, data: Any
 ) -> KneeLoads:
-    """Return the solved loads in the axes of the user's knee, and as forces on its joints.
-
-    Args:
-        geometry: geometry of the equations.
-        solved: solution of the equations of a right knee.
-        friction: Coulomb coefficient of the femorotibial contact.
-        bridge: conversion to the user's model.
-        data: Pinocchio data with joint placements up to date.
-    """
+    """Return the solved loads in the axes of the user's knee, and as forces on its joints."""
     unknowns = [] if solved.problems else solved_unknowns(geometry, solved, friction)
     # The first word of an unknown's name is its group. Ligaments are known loads.
     groups: dict[str, list[PointForces]] = {"external": [], "residual": [], "hip": []}
@@ -181,7 +173,7 @@ def knee_loads(
 
 
 def _of_patella(geometry: KneeGeometry, solved: SolvedLoads) -> dict[str, float]:
-    """Return the tensions, N, of the ligaments of a released patella."""
+    """Return the tensions, N, of a released patella's ligaments."""
     released = None if geometry.extensor is None else geometry.extensor.released
     if released is None or released.found is None or solved.problems:
         return {}

@@ -1,6 +1,6 @@
 """Muscles and their lines of action, with unknown or given tensions.
 
-A line of action is a massless string through points of the links. It may wrap the outline of one
+A line of action is a massless string through points of the links, which may wrap the outline of one
 link. The forces of a unit tension on all links of the line are one column of the equations of
 motion. The moment arm of a line of length L about a coordinate q of the chain is -dL/dq.
 """
@@ -106,12 +106,7 @@ class Wrap:
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """A line of action: a string through points of the links.
-
-    Args:
-        points: from the proximal to the distal end, at least two.
-        wrap: outline that the line wraps; None: straight from point to point.
-    """
+    """A string through points of the links, the proximal end first."""
 
     name: str
     points: tuple[LinkPoint, ...]
@@ -145,9 +140,8 @@ class Line:
         )
 
     def loads(self, path: "TautPath") -> tuple[PointForces, ...]:
-        """Return the forces of a unit tension on the links, the two ends first. Their sum is zero.
-
-        The force at an inner point or corner is the change of direction.
+        """Return the forces of a unit tension on the links, the two ends first. Their sum is zero;
+        at an inner point or corner the force is the change of direction.
         """
         links = [point.link for point in self.points]
         if self.wrap:
@@ -168,7 +162,7 @@ class Line:
 
 
 def off_femur(points: Sequence[LinkPoint], chain: "Chain") -> int:
-    """Return the number of the segment of a line that leaves the femur."""
+    """Return the number of the segment that leaves the femur."""
     carriers = [chain.carrier(point.link) for point in points]
     for i, (one, other) in enumerate(pairwise(carriers)):
         if one == "femur" != other:
@@ -177,7 +171,7 @@ def off_femur(points: Sequence[LinkPoint], chain: "Chain") -> int:
 
 
 def muscle_line(muscle: Muscle, chain: "Chain", femoral: "Surface") -> Line:
-    """Return a muscle's line of action. It may wrap the femoral component in the patella's plane.
+    """Return a line of action, which may wrap the femoral component in the patella's plane.
 
     `femoral` is in the femur link's frame.
     """
@@ -196,7 +190,7 @@ def muscle_line(muscle: Muscle, chain: "Chain", femoral: "Surface") -> Line:
 def check_muscles(muscles: Sequence[Muscle], chain: "Chain") -> None:
     """Raise an error unless there is one muscle, from the femur to the patella.
 
-    Equilibrium does not determine how several muscles share the joint moments.
+    Equilibrium does not determine how several muscles share a moment.
     """
     for muscle in muscles:
         if len({chain.carrier(point.link) for point in muscle.points}) == 1:
@@ -249,7 +243,7 @@ class TensionLine:
         ]
 
     def _points(self, data: Any) -> tuple[list[pin.SE3], Array]:
-        """Return the placement of each point's joint, and the points (m, 3), in the world."""
+        """Return each point's joint placement, and the points (m, 3), in the world."""
         placements = [data.oMi[frame.joint] for frame in self.frames]
         points = [
             placement.act(frame.placement.act(position))
@@ -324,7 +318,6 @@ def checked_tensions(
     Args:
         tensions: muscle -> tension, N; or the tension of the quadriceps alone, N.
         extensor: names of the lines of the extensor mechanism, the quadriceps first.
-        lines: names of the other muscles.
     """
     if tensions is None:
         return {}

@@ -187,7 +187,7 @@ FRAME_TOLERANCE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Surfaces:
-    """The implant's surfaces, mirrored for a left knee, in the frames of their parts."""
+    """The implant's surfaces in their parts' frames, mirrored for a left knee."""
 
     femoral: Surface | None
     insert: Surface | None
@@ -197,7 +197,7 @@ class Surfaces:
 def surfaces_of(
     implant: Implant, is_left: bool, with_contact: bool, with_extensor: bool
 ) -> Surfaces:
-    """Return the surfaces of an implant, with the insert in the frame "insert"."""
+    """Return the surfaces, with the insert in the frame "insert"."""
     needs = {"femoral": with_contact or with_extensor}
     needs |= {"insert": with_contact, "patella": with_extensor}
     surfaces: list[Surface | None] = []
@@ -217,7 +217,7 @@ def surfaces_of(
 def placed_insert(
     anatomy: Anatomy, implant: Implant, insert: Surface | None, is_left: bool
 ) -> tuple[FixedFrame, Surface | None]:
-    """Return the insert frame on the tibia, and the insert's surface in that frame."""
+    """Return the insert frame on the tibia, and the insert's surface in it."""
     frame = anatomy.insert
     if insert is None or implant.placed:
         return frame, insert
@@ -233,7 +233,7 @@ def placed_insert(
 
 
 def bundle_on_chain(bridge: Bridge, bundle: "Ligament") -> "Ligament":
-    """Return a bundle with its ends and surfaces on links of the chain."""
+    """Return a bundle on links of the chain."""
     ends = [bridge.link_point(link_point(end)) for end in (bundle.proximal, bundle.distal)]
     where = f"ligament {bundle.name}"
     slack = real_number(
@@ -248,9 +248,9 @@ def bundle_on_chain(bridge: Bridge, bundle: "Ligament") -> "Ligament":
 def crossing_and_others(
     chain: Chain, bundles: "Sequence[Ligament]"
 ) -> "tuple[BundleArrays | None, tuple[Ligament, ...]]":
-    """Return the bundles between femur and tibia as arrays, and all other bundles.
+    """Return the bundles between femur and tibia as arrays, and all others.
 
-    The ends of the arrays are in the femoral frame and the insert frame.
+    The arrays' ends are in the femoral frame and the insert frame.
     """
     crossing = [bundle for bundle in bundles if set(bundle.links) == {"femur", "tibia"}]
     others = tuple(bundle for bundle in bundles if bundle not in crossing)
@@ -295,7 +295,7 @@ def extensor_lines(bridge: Bridge, extensor: Extensor, surfaces: Surfaces) -> "E
 def prepared_contact(
     contact: "ContactModel | KneeContact | str", implant: Implant, surfaces: Surfaces, cache: bool
 ) -> "KneeContact":
-    """Return a contact model that is prepared for the surfaces of an implant."""
+    """Return a contact model prepared for an implant's surfaces."""
     from tkamb.contact.pair import ContactPair
     from tkamb.knee.contact import KneeContact
 
@@ -310,7 +310,7 @@ def prepared_contact(
 def prepared_button(
     contact: "ContactModel | str", implant: Implant, surfaces: Surfaces, chain: Chain, cache: bool
 ) -> "Button":
-    """Return a contact model that is prepared for the button and the femoral component."""
+    """Return a contact model prepared for button and femoral component."""
     from tkamb.contact.pair import ContactPair
     from tkamb.knee.button import Button, button_in_patella, without_pegs
 
@@ -325,7 +325,7 @@ def prepared_button(
 
 
 def as_model(contact: "ContactModel | str", where: str, cache: bool = True) -> "ContactModel":
-    """Return a contact model, from its name if need be; `cache` False: a lattice without one."""
+    """Return a contact model, perhaps by name; `cache` False: a lattice without one."""
     from tkamb.contact.model import ContactModel
     from tkamb.contact.registry import contact_model
 
@@ -340,7 +340,7 @@ def as_model(contact: "ContactModel | str", where: str, cache: bool = True) -> "
 
 
 def _prepared_pair(model: "ContactModel", pair: "ContactPair") -> "KneeContact":
-    """Return a contact model that is prepared for a pair, or that of another knee with the same."""
+    """Return the prepared model, of another knee if that has the same pair."""
     from tkamb.knee.contact import KneeContact
 
     key = _content(pair, model)
@@ -357,9 +357,8 @@ _PREPARED: "weakref.WeakValueDictionary[str, KneeContact]" = weakref.WeakValueDi
 
 
 def _content(pair: "ContactPair", model: "ContactModel") -> str | None:
-    """Return the SHA-256 of all that a prepared contact depends on, settings included.
-
-    None: the model cannot be pickled, so that its options are unknown.
+    """Return the SHA-256 of all that a prepared contact depends on; None: the model cannot be
+    pickled, its options are unknown.
     """
     parts = (model, pair.material, pair.bearing, pair.__dict__.get("split"), changed_settings())
     try:

@@ -22,7 +22,8 @@ class PatellaSettings:
 
     least_determinant: float = 1e-6
     """1: determinant of the unit vectors of contact normal and ligament below which the two are
-    parallel. Chosen because it is above rounding errors."""
+    parallel. It is above rounding errors.
+    """
 
 
 PATELLA = PatellaSettings()
@@ -43,7 +44,7 @@ class PatellaStatus(Enum):
 
     @property
     def found(self) -> bool:
-        """Whether the patella was found. If not, the value states the condition that failed."""
+        """Whether the patella was found; if not, the value states the failed condition."""
         return self in (PatellaStatus.OK, PatellaStatus.SEVERAL, PatellaStatus.EDGE)
 
 
@@ -112,7 +113,7 @@ class ExtensorMechanism:
 class PatellaBalance:
     """Forces on the patella per unit muscle tension, in the patellar joint's frame.
 
-    `moment` is the residual moment per unit tension, m. `slopes` are those of `PatellaState`.
+    `moment` is the residual one per unit tension, m; `slopes` as in `PatellaState`.
     """
 
     coordinates: Array
@@ -212,7 +213,7 @@ class PatellaFrame:
         )
 
     def state(self, balance: PatellaBalance, status: PatellaStatus) -> PatellaState:
-        """Return the state of the patella from the forces on it, in the insert frame."""
+        """Return the state from the forces, in the insert frame."""
         contact = balance.contact
         in_patella = inverse(self.mechanism.contact.pose(balance.coordinates))
         return PatellaState(

@@ -1,7 +1,4 @@
-"""The contact that `tkamb.Knee` returns, of one configuration or of many.
-
-It is in the frames of the user's knee, right or left.
-"""
+"""The contact that `tkamb.Knee` returns, of one configuration or of many, in the user's frames."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -125,7 +122,7 @@ def contact_of_equations(result: ContactResult, left: bool) -> ContactResult:
 
 @dataclass(frozen=True, eq=False)
 class PressBatch:
-    """The presses of n poses. A press that failed has NaN; an unloaded condyle has zero.
+    """The presses of n poses; NaN for a failed press, zero for an unloaded condyle.
 
     Args:
         force: contact forces of the medial and lateral condyle, (n, 2), N.
@@ -169,7 +166,7 @@ def press_all(
 ) -> PressBatch:
     """Return the presses at q (n, nq) under one load or a load per pose (n,), N.
 
-    The warm start of each press is the press before it.
+    Each press is the warm start of the next.
     """
     count = len(q)
     if np.shape(load) not in ((), (count,)):

@@ -1,19 +1,17 @@
 """Muscle forces and compliance over the passes of a search for released coordinates.
 
-The muscle forces depend on the knee's equilibrium, and the equilibrium depends on the muscle
-forces. Under a light load the knee is compliant, and a plain iteration between the two would
-oscillate. Each pass therefore changes the applied forces f by a share omega of the difference from
-the required forces f',
+The muscle forces depend on the knee's equilibrium, and this on the muscle forces; under a light
+load the knee is compliant, and a plain iteration would oscillate. Each pass therefore changes the
+applied forces f by a share omega of the difference from the required forces f',
 
     f <- f + omega (f' - f),   omega <- -omega d . (d' - d) / |d' - d|²,
 
 where d and d' are the last two differences f' - f (Aitken's secant for a vector).
 
-The moment arms of the muscles depend on the compliance of the knee, and the compliance depends on
-the equilibrium. The first passes use the measured compliance. Later passes change the compliance by
-half of its difference from the measured value, then by a quarter. The compliance then converges
-even if the contact's stiffness changes fast with the pose. After these passes the compliance stays
-constant, and `compliance_error` is the remaining relative difference.
+The moment arms of the muscles depend on the compliance, and this on the equilibrium: the first
+passes use the measured compliance, later ones change it by half of its difference from the measured
+one, then by a quarter, so that it converges even if the contact's stiffness changes fast with the
+pose. After these it stays constant, and `compliance_error` is the remaining relative difference.
 
 References: Irons & Tuck, Int J Numer Methods Eng 1:275 (1969), doi:10.1002/nme.1620010306;
 Küttler & Wall, Comput Mech 43:61 (2008), doi:10.1007/s00466-008-0255-5.
@@ -50,7 +48,7 @@ class Relaxation:
     """The muscles' forces over the passes of one search.
 
     Attributes:
-        converged: whether the applied forces have converged to the required forces.
+        converged: whether the applied forces have converged.
         compliance_error: relative difference of the measured compliance from the compliance in use.
     """
 
@@ -83,11 +81,7 @@ class Relaxation:
         return relaxed
 
     def relaxed_forces(self, required: "MuscleShare") -> "MuscleShare":
-        """Return the forces of the next pass.
-
-        Args:
-            required: muscle forces at the equilibrium of the last pass.
-        """
+        """Return the forces of the next pass, by those required at the last equilibrium."""
         applied, self._applied, self.converged = self._applied, required, False
         if applied is None:
             return required

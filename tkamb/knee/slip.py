@@ -12,7 +12,7 @@ the insert. The rate of the slip is the x velocity of the femur's contact point 
 insert, without the axial part; `sliding_velocity` computes it without arcs.
 
 If the tangent of a profile turns by d between two points, the arc is chord (d/2)/sin(d/2). This is
-exact on a circle. On other profiles the error is of third order in the step.
+exact on a circle, and of third order in the step on other profiles.
 """
 
 from dataclasses import dataclass
@@ -61,9 +61,8 @@ class InsertProfile:
         self._above = float(insert.bounds[1, 1]) + 1e-3
 
     def at(self, points: Array) -> tuple[Array, Array]:
-        """Return the height y (n,), m, and the sagittal slope (n,), rad, at points (n, 3).
-
-        NaN beside the insert.
+        """Return height y (n,), m, and sagittal slope (n,), rad, at points (n, 3); NaN beside the
+        insert.
         """
         start = np.array(points, float)
         start[:, 1] = self._above
@@ -183,8 +182,8 @@ def roll_slip_motion(
 ) -> Array:
     """Return the motion of Sharma (2008): AP follows from rolling and slip, SI from first touch.
 
-    The mean of the condyles' contact points moves backwards along the insert by the femoral arc
-    less the slip; in every frame the femur is lowered to first touch.
+    The mean contact point moves backwards along the insert by the femoral arc less the slip; the
+    femur is lowered to first touch in every frame.
 
     Args:
         split: z between the condyles in the femoral frame, m; None: one condyle.
@@ -216,7 +215,7 @@ def roll_slip_motion(
 def _mean_condyle(lowest: LowestPoints, poses: Array) -> tuple[Array, Array]:
     """Return arms (f, 3), m, and femoral arcs (f-1,), m, as means over the condyles.
 
-    An arm goes from the femoral origin to the lowest point. Both depend on the rotations alone.
+    An arm goes from the femoral origin to the lowest point; both depend on the rotations alone.
     """
     condyle_points = [[point for point in lowest.at(pose) if point is not None] for pose in poses]
     points = np.array(condyle_points).swapaxes(0, 1)

@@ -72,7 +72,7 @@ def _evaluated(contact: KneeContact, femur_pose: Array) -> LoadedPoints:
 
 
 def _means(points: LoadedPoints) -> tuple[Array, Array]:
-    """Return the means (2,) of order `ORDER`, Pa, and their derivative (2, 6), zero if unknown."""
+    """Return means (2,) of order `ORDER`, Pa, and derivative (2, 6), zero if unknown."""
     means, slopes = np.zeros(2), np.zeros((2, 6))
     for k, side in enumerate((points.medial, ~points.medial)):
         pressure, share = points.pressure[side], points.area[side] / AREA

@@ -40,7 +40,7 @@ EQUILIBRIUM_DIFFERENCE = DifferenceSettings(step=1e-6)
 
 @dataclass(frozen=True, eq=False)
 class PressDerivatives:
-    """Derivatives of a press. The rows are those of `PRESS_ROWS`, N and m.
+    """Derivatives of a press: the rows are `PRESS_ROWS`, N and m.
 
     Args:
         by_load: derivative by the load, (4,), 1 and m/N.
@@ -97,7 +97,7 @@ def press_derivatives(
 
 
 def condyle_slopes(contact: "ProbedContact") -> Array:
-    """Return the derivative (2, 6) of the condyles' forces by a displacement of the femur."""
+    """Return the derivative (2, 6) of the condyles' forces by a displacement."""
     slopes = np.zeros((2, 6))
     for k, side in enumerate(SIDES):
         if side in contact.condyles:
@@ -122,10 +122,8 @@ def _touch_slope(pair: "ContactPair", pose: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class EquilibriumDerivatives:
-    """Derivatives of an equilibrium. The eight rows are six knee coordinates and two forces.
-
-    The coordinates are those of `Equilibrium.coordinates` (m and rad), then come the forces (N) of
-    the medial and the lateral condyle.
+    """Derivatives of an equilibrium: eight rows. Six are `Equilibrium.coordinates` (m and rad),
+    then the forces (N) of medial and lateral condyle.
 
     Args:
         by_load: by a wrench on the tibia about the insert's origin, (8, 6), N and N·m, in
@@ -207,7 +205,7 @@ class ImplicitEquilibrium:
         )
 
     def _rows(self, released: Array, held: Array | None = None) -> Array:
-        """Return the rows (8, m) of changes of the released coordinates (n, m)."""
+        """Return (8, m) for changes of the released coordinates (n, m)."""
         knee = self._knee
         coordinates = np.zeros((6, released.shape[1])) if held is None else held.copy()
         coordinates[list(self._search.released)] += released

@@ -74,24 +74,24 @@ class WrapObject:
 
     @property
     def key(self) -> tuple[Any, ...]:
-        """All that determines a path over the object; equal for equal objects."""
+        """All that determines a path over the object."""
         outline = None if self.outline is None else self.outline.tobytes()
         sizes = (self.dimensions, self.quadrant, self.active, outline)
         return (self.body, self.shape, self.pose.tobytes(), *sizes)
 
     def on(self, body: str, pose_body_in_other: Array) -> Self:
-        """Return the same object given on another body that is fixed to its body."""
+        """Return the object on another body that is fixed to its body."""
         return replace(self, body=body, pose=pose_body_in_other @ self.pose)
 
     def mirrored(self) -> Self:
-        """Return the mirror image of the object, on the mirror image of its body."""
+        """Return the mirror image, on the mirror image of its body."""
         quadrant = self.quadrant
         if quadrant is not None and quadrant[0] == 2:
             quadrant = (2, -quadrant[1])
         return replace(self, pose=mirrored_pose(self.pose), quadrant=quadrant)
 
     def scaled(self, factor: float) -> Self:
-        """Return the object of a body whose lengths are multiplied by a factor."""
+        """Return the object with all lengths multiplied by a factor."""
         placed = self.pose.copy()
         placed[:3, 3] *= factor
         outline = None if self.outline is None else factor * self.outline

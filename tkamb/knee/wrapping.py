@@ -31,7 +31,6 @@ class TautPath:
 
     Args:
         points: start, touched corners of the outline, end, (m, 3), m.
-        length: length of the path, m.
         wrap_angle: change of direction in the bone's sagittal plane, rad; 0: straight.
     """
 
@@ -52,12 +51,12 @@ class TautPath:
 
     @property
     def start_direction(self) -> Array:
-        """Unit vector (3,) along the string at its start. Tension pulls the start this way."""
+        """Unit vector (3,) along the string at its start, which tension pulls this way."""
         return np.asarray(self.directions[0])
 
     @property
     def end_direction(self) -> Array:
-        """Unit vector (3,) along the string at its end. Tension pulls the end the opposite way."""
+        """Unit vector (3,) along the string at its end, which tension pulls the opposite way."""
         return np.asarray(self.directions[-1])
 
     def moved(self, pose_here_in_there: Array) -> "TautPath":
@@ -74,8 +73,8 @@ def taut_path(start: Array, end: Array, outline: Array) -> TautPath:
     """Return the taut path around an outline in the bone's frame.
 
     The clockwise angle from start to end about the outline's centre, between -90 and 270 deg,
-    decides on which side the string passes. All are in the bone's frame; `outline` (n, 2), m, is a
-    strictly convex polygon in x-y, counter-clockwise.
+    decides on which side the string passes. `outline` (n, 2), m, is a strictly convex polygon in
+    x-y, counter-clockwise.
 
     Raises:
         ComputationError: start or end lies inside the outline.
@@ -151,7 +150,7 @@ def _crosses(start: Array, end: Array, outline: Array) -> bool:
 
 @compiled_as_written
 def _taut(start: Array, end: Array, outline: Array) -> tuple[Array, float, float, int]:
-    """Return the taut path's points (m, 3), length and turn, and the end inside the outline.
+    """Return points (m, 3), length and turn, and the end inside the outline.
 
     It is straight if the segment misses the outline; otherwise it touches it from the corner of the
     tangent through the start to that of the tangent through the end.

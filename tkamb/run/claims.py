@@ -1,7 +1,7 @@
-"""What a run may be said to show. Report, terminal, viewer, `compare` and summary read these facts.
+"""What a run may be said to show.
 
-A claim is decided here once, from the numbers of the run and from the measured knees of
-docs/truth.md, so that no output contradicts another one or a measurement.
+A claim is decided here once, from the run's numbers and the measured knees of docs/truth.md, for
+report, terminal, viewer, `compare` and summary: no output contradicts another one or a measurement.
 """
 
 import json
@@ -66,10 +66,10 @@ class Split:
 
 
 def split_of(columns: Mapping[str, Any]) -> Split:
-    """Return the split that a run may state.
+    """Return the split that a run may state: by deformation if the pose determines it in all
+    frames, else by equilibrium.
 
-    The split is by deformation if the pose determines it in all frames, else by equilibrium. The
-    estimates differ if their medial shares are more than `AGREEMENT.share_difference` apart.
+    The estimates differ if their medial shares are more than `AGREEMENT.share_difference` apart.
     """
     frames = len(columns["status"])
     shares = {name: _share(columns, name) for name in ESTIMATES}
@@ -85,7 +85,7 @@ def split_of(columns: Mapping[str, Any]) -> Split:
 
 
 def _share(columns: Mapping[str, Any], estimate: str) -> Array:
-    """Return medial / (medial + lateral) (f,) of an estimate; NaN without load."""
+    """Return medial / (medial + lateral) (f,); NaN without load."""
     names = [ESTIMATES[estimate].replace("<side>", side) for side in FORCES[1:]]
     nothing = np.full(len(columns["status"]), np.nan)  # a knee of one condyle has one column
     medial, lateral = (np.asarray(columns.get(name, nothing), float) for name in names)
@@ -102,7 +102,6 @@ def peaks(
 
     Args:
         bands: columns of bands.csv; empty: no input was varied.
-        body_weight: body weight, N.
 
     Returns:
         Force -> column, nominal, frame, time_s, flexion_deg, supported (False: the two estimates of
@@ -137,12 +136,10 @@ class MeasuredTrial:
     """Error of tkamb in a trial with measured forces; docs/truth.md has the same numbers.
 
     Args:
-        activity: name of the activity, as in [output] activity.
         muscles: True: all muscles of the leg; False: the quadriceps alone.
         rmse_BW: force -> root mean square error, BW.
         bias_BW: mean error of the total force, predicted minus measured, BW.
-        peak_BW: predicted peak of the total force, BW.
-        measured_peak_BW: measured peak of the total force, BW.
+        peak_BW: predicted peak of the total force, BW; `measured_peak_BW` is the measured one.
     """
 
     trial: str
@@ -166,8 +163,6 @@ class MethodError:
     """The measured error of the method, as far as it applies to a run.
 
     Args:
-        activity: activity of the run; None: not stated.
-        muscles: whether the run has all muscles, as `MeasuredTrial.muscles`.
         trials: measured trials with these muscles in this activity; if there are none, of all
             activities.
         same_activity: whether the trials are of the activity of the run.
@@ -203,7 +198,7 @@ class MethodError:
 
     @property
     def sentences(self) -> list[str]:
-        """Sentences on the errors, first on an activity without a measurement."""
+        """Sentences on the errors, first on an activity without measurement."""
         return texts.lines("tkamb.run", "error.txt", error=self, groups=self.groups)
 
     @property
@@ -225,11 +220,7 @@ def bias_words(trials: Sequence[MeasuredTrial]) -> str:
 
 
 def method_error(summary: Mapping[str, Any]) -> MethodError:
-    """Return the measured error of the method that applies to a run.
-
-    Args:
-        summary: content of summary.json; `activity` and `scene_tables` are used.
-    """
+    """Return the measured error of the method that applies to a run."""
     activity = summary.get("activity")
     muscles = bool((summary.get("scene_tables") or {}).get("muscles"))
     alike = tuple(one for one in measured_trials() if one.muscles is muscles)
@@ -238,7 +229,7 @@ def method_error(summary: Mapping[str, Any]) -> MethodError:
 
 
 def compared_forces(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Return name of a measured force -> its comparison with this run, if frames were compared."""
+    """Return measured force -> its comparison with this run, if frames were compared."""
     measured = summary.get("measured") or {}
     return {name: one for name, one in measured.items() if one["frames_compared"]}
 
@@ -255,7 +246,7 @@ def claims_summary(columns: Mapping[str, Any], body_weight: float) -> dict[str, 
 
 
 def peaks_of(results: "Results") -> dict[str, dict[str, Any]]:
-    """Return the peak forces of a run with their bands (`peaks`)."""
+    """Return the peak forces of a run with bands (`peaks`)."""
     from tkamb.run.metrics import body_weight
 
     return peaks(results.columns, results.bands, body_weight(results))

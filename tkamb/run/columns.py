@@ -6,7 +6,7 @@ from functools import cache
 from typing import Literal
 
 WITHOUT_MUSCLES = "Without [muscles]"
-"""Beginning of the notes that hold only for a scene without the table [muscles]."""
+"""Beginning of notes for a scene without [muscles]."""
 
 Kind = Literal["number", "integer", "text"]
 
@@ -16,10 +16,9 @@ class Column:
     """One column of results.csv.
 
     Args:
-        name: name of the column in the file, ends with the unit.
         meaning: one line. Vectors are in the insert frame unless the line names another.
         needs: scene tables without which the column is empty.
-        optional: True if a scene without `needs` has no such column; False if the column is empty.
+        optional: True: a scene without `needs` has no such column. False: it is empty.
     """
 
     name: str
@@ -48,7 +47,7 @@ BUTTON_NEEDS = "[contact.patellofemoral]; without it there is no such column"
 _POST = "[contact] post; without it there is no such column"
 
 LIGAMENT = "ligament_<name>_N"
-"""Family of columns: one per [[ligament]], in the order of the scene."""
+"""Family with a column per [[ligament]], in the scene's order."""
 MUSCLE_FORCE = "muscle_<name>_N"
 ACTIVATION = "activation_<name>"
 RESERVE = "reserve_<coordinate>_Nm"
@@ -65,7 +64,7 @@ FAMILIES = (
 """Each family has one column per ligament, muscle or coordinate."""
 
 SECONDS = "_seconds"
-"""Ending of the columns of computing times, which differ from run to run."""
+"""Ending of computing times, which differ from run to run."""
 
 COLUMNS: tuple[Column, ...] = (
     Column("time_s", "time of the frame"),
@@ -401,13 +400,13 @@ COLUMNS: tuple[Column, ...] = (
 )
 
 RENAMED = {"softest_N_per_mm": "smallest_stiffness_N_per_mm"}
-"""Name of a column in results of earlier releases -> its name in this release."""
+"""Column of earlier releases -> its present name."""
 
 KINDS: dict[str, Kind] = {column.name: column.kind for column in COLUMNS}
 
 
 def _ends(family: str) -> tuple[str, str]:
-    """Return the parts of a family's column names before and after the inserted name."""
+    """Return a family's name before and after the inserted one."""
     return family[: family.index("<")], family[family.index(">") + 1 :]
 
 
@@ -453,9 +452,8 @@ def ligament_of(column: str) -> str:
 
 
 def ordered_names(present: Iterable[str]) -> tuple[str, ...]:
-    """Return the columns of a file in order.
-
-    Members of families and optional columns are included only if `present` names them.
+    """Return the columns of a file in order, with members of families and optional ones if
+    `present` names them.
     """
     present = list(present)
     names: list[str] = []

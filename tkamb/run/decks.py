@@ -1,22 +1,21 @@
 """The contact of one frame as an input file (deck) of CalculiX or FEBio 4, in mm, N and MPa.
 
-Both decks contain the hexahedra of the insert and a rigid patch of the femoral component that moves
-along y only.
+Both decks contain the hexahedra of the insert, with contact nodes on the smooth surface that
+approximates its mesh, as in the lattice, and a rigid, faceted patch of the femoral component that
+moves along y only.
 
 CalculiX: contact is node to surface by penalty. The force on a node is its pressure times its
-tributary area of the deformed faces. The patch is a layer of wedges. It
-starts at a guessed depth in the insert, under the whole load. CalculiX finds the equilibrium.
+tributary area of the deformed faces. The patch is a layer of wedges, which starts at a guessed
+depth in the insert, under the whole load; CalculiX finds the equilibrium.
 
 FEBio: the insert is an isotropic elastic (St. Venant-Kirchhoff) solid in finite deformation.
 Contact is sliding-elastic and frictionless, by augmented Lagrangian. The patch is displaced from
-first touch by the approach of the run, and FEBio returns the force. A load is not prescribed, since
-the stiffness is zero at first touch.
+first touch by the approach of the run, and FEBio returns the force: a load cannot be prescribed,
+since the stiffness is zero at first touch.
 
 Reference: FEBio User Manual 4.0, chapter 3, the input file format.
 
-The insert is a grid of hexahedra. Its contact nodes lie on the smooth surface that approximates the
-insert's mesh, as in the lattice. The femoral component is a rigid, faceted patch. Its initial depth
-is the approach of the foundation model under the load. The solution of the run is not used.
+The guess is the approach of the foundation model, not the solution of the run.
 """
 
 from collections.abc import Iterable, Iterator
@@ -66,8 +65,6 @@ class Deck:
     Args:
         lattice: nodes and hexahedra of the insert.
         patch: part of the femoral component that can touch, at its initial pose, insert frame.
-        material: material of the insert.
-        bearing: boundary condition of the insert's bottom.
         load: load along -y, N.
         element: "C3D8" (full integration, locks as nu approaches 0.5) or "C3D8I" (incompatible
             modes).
@@ -186,10 +183,8 @@ class PressProblem:
 
     Args:
         pair: insert and femoral component.
-        lattice: grid of the insert with contact nodes on the smooth surface.
         nodes: contact nodes, (c,).
-        map: contact surface of the insert.
-        pose: pose_femoral_in_insert at the guessed depth, (4, 4).
+        nodes: contact nodes, (c,).
         depth: guessed approach, m.
         touchable: mask of the contact nodes that can touch, (c,).
         patch: femoral triangles above these nodes, insert frame.
@@ -212,7 +207,6 @@ def press_problem(pair: ContactPair, load: float, pose: Array, grid_mm: float) -
     """Return a press as a finite-element problem.
 
     Args:
-        pair: insert and femoral component.
         load: load along -y, N.
         pose: pose_femoral_in_insert, (4, 4); its y is not used.
         grid_mm: edge of the hexahedra, mm.
@@ -241,7 +235,7 @@ def press_problem(pair: ContactPair, load: float, pose: Array, grid_mm: float) -
 
 
 def _patch(femoral: Surface, points: Array, spacing: float) -> Surface:
-    """Return the downward triangles within one cell of any of the points, seen from above."""
+    """Return the downward triangles within one cell of any point, seen from above."""
     down = np.flatnonzero(femoral.face_normals[:, 1] < LARGEST_NORMAL_Y)
     middle = femoral.triangles[down].mean(axis=1)[:, ::2]
     away, _ = cKDTree(points[:, ::2]).query(middle, distance_upper_bound=spacing)
@@ -254,12 +248,11 @@ SUFFIX = {"ccx": ".inp", "feb": ".feb"}
 
 @dataclass(frozen=True, eq=False)
 class FramePress:
-    """The contact of one frame as a finite-element problem, with the results of the run.
+    """The contact of one frame as a finite-element problem, with the run's results.
 
     Args:
-        problem: problem at the pose of the frame, except for its y. The load is the vertical sum
-            of the frame's nodal forces.
-        approach: approach in the run, m.
+        problem: problem at the pose of the frame, except for its y. The load is the vertical sum of
+            the frame's nodal forces.
         peak_pressure: largest pressure of the map, Pa.
         origin: text with frame number, folder of the run and contact model.
         lateral: direction of insert z, "lateral" or "medial".

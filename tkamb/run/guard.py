@@ -1,7 +1,7 @@
 """Execution of a command, with each error as one line on standard error.
 
-Exit statuses: 0 success, 1 failure, 2 bad input, 130 interrupted. The
-traceback of an unexpected error is written to a log file.
+Exit statuses: 0 success, 1 failure, 2 bad input, 130 interrupted. An unexpected error's traceback
+is written to a log file.
 """
 
 import argparse
@@ -45,11 +45,7 @@ OPTIONS = {
 
 
 def guarded(command: Callable[[], int], options: argparse.Namespace) -> int:
-    """Run a command and return its exit status. An error is printed as one line.
-
-    Args:
-        command: function that returns an exit status.
-    """
+    """Run a command and return its exit status; an error is printed as one line."""
     open_streams()
     try:
         with warnings.catch_warnings():
@@ -82,7 +78,7 @@ def guarded(command: Callable[[], int], options: argparse.Namespace) -> int:
 
 
 def in_options(message: str, where: object = None) -> str:
-    """Return a message with options of commands in place of arguments of Python functions.
+    """Return a message with options in place of arguments of Python functions.
 
     Args:
         where: place of the error; its first word may be the name of an argument.
@@ -97,7 +93,7 @@ def in_options(message: str, where: object = None) -> str:
 
 @contextmanager
 def interrupt_as_such() -> Iterator[None]:
-    """Raise KeyboardInterrupt for a SystemError that an interrupt in compiled code has caused."""
+    """Raise KeyboardInterrupt for a SystemError by an interrupt in compiled code."""
     try:
         yield
     except SystemError as error:
@@ -146,7 +142,7 @@ def _is_harmless(character: str) -> bool:
 
 
 class _PrintableFormatter(logging.Formatter):
-    """Escapes control characters: messages quote texts from files, which could alter a terminal."""
+    """Escapes control characters, which quoted files could contain to alter a terminal."""
 
     def format(self, record: logging.LogRecord) -> str:
         return printable(super().format(record))
@@ -160,10 +156,10 @@ def log_to_stderr() -> None:
 
 
 def open_streams() -> None:
-    """Open the standard streams that are closed, and make failed writes raise `StreamError`.
+    """Open closed standard streams, and make failed writes raise `StreamError`.
 
-    The next opened file would get the number of a closed stream, and printed text would be written
-    into it. A closed standard output is opened for reading only, so that printing fails.
+    The next opened file would get a closed stream's number, and printed text. A closed standard
+    output is opened for reading only, so that printing fails.
     """
     for number in range(3):
         try:
@@ -215,10 +211,9 @@ def _unexpected(error: Exception, options: argparse.Namespace) -> int:
 def unforeseen_words(error: Exception, options: argparse.Namespace) -> str:
     """Return one line on an unexpected error, and write its traceback to a log file.
 
-    The line names the plug-in that raised the error, if any.
+    It names the plug-in that raised the error, if any.
 
     Args:
-        error: exception that is not a `TkambError`.
         options: options of the command line; the log file goes to the folder `out`.
     """
     name = type(error).__name__
@@ -251,6 +246,6 @@ def _write_log(error: Exception, options: argparse.Namespace) -> Path | None:
 
 
 def _log_folders(out: Path | None) -> list[Path]:
-    """Return the output folder and its parent, the working and the temporary directory."""
+    """Return the output folder, its parent, the working and the temporary directory."""
     beside = [] if out is None else [out, out.parent]
     return [*(path for path in beside if path.is_dir()), Path.cwd(), Path(tempfile.gettempdir())]

@@ -1,7 +1,7 @@
 """Identity of a run: hashes of scene, files and code. `case_of_results` checks it.
 
-Two runs with the same identity compute the same numbers. The identity includes the code of
-plug-ins for contact models, since a change in it may change the numbers.
+Two runs with the same identity compute the same numbers; it therefore includes the code of
+plug-ins.
 """
 
 import hashlib
@@ -33,7 +33,7 @@ GROUPS = {
 
 
 CODE, CONTACT_CODE = "code of tkamb", "code of the contact model"
-"""Keys of the identity for the hashes of tkamb and of a plug-in."""
+"""Keys of the identity: the hashes of tkamb and of a plug-in."""
 SUFFIXES = (".py", ".so", ".pyd")
 
 
@@ -75,13 +75,13 @@ def package_code(module: str) -> str:
 def scene_hash(scene: "Scene") -> str:
     """Return the SHA-256 of a validated scene and of the content of all files that it names.
 
-    The names and places of the files do not count: a copy of scene and files has the same hash.
+    A copy of scene and files in another place has the same hash.
     """
     return hashlib.sha256(json.dumps(scene_content(scene)).encode()).hexdigest()
 
 
 def scene_content(scene: "Scene") -> Any:
-    """Return the scene as JSON types, with the SHA-256 of the content in place of each path."""
+    """Return the scene as JSON types, with the SHA-256 of a file's content in place of its path."""
     unused: dict[str, Any] = {"base": True, "output": {"directory"}, "wear": True}
     unused |= {} if scene.material else {"material": True}
     if scene.contact and scene.contact.patellofemoral is None:  # the hash of earlier releases
@@ -126,10 +126,7 @@ def relative_name(path: Path, folder: Path) -> str:
 
 
 def run_identity(case: "Case", frames: range) -> dict[str, Any]:
-    """Return the identity of a run: hashes of scene, files and code, frames and version.
-
-    The identity of a run with a plug-in's contact model includes the hash of the plug-in.
-    """
+    """Return the identity of a run: hashes of scene, files and code, frames and version."""
     identity = {
         "scene": settings_hash(case.scene),
         "content of a file": files_hash(case),
@@ -153,7 +150,7 @@ def files_hash(case: "Case") -> str:
 def input_hashes(case: "Case", scene: Path | None) -> dict[str, str]:
     """Return name -> SHA-256 of the scene file, its base and all files that the run reads.
 
-    Names are relative to the folder of the scene file. Without a scene file they are absolute.
+    Names are relative to the folder of the scene file, or absolute without one.
     """
     from tkamb.io.scene.scene import scene_files
 
@@ -202,12 +199,12 @@ def case_of_results(results: "Results") -> "Case":
 
 
 def overrides_of_run(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Return dotted key -> value of the keys that the run changed in its scene (`--set`)."""
+    """Return dotted key -> value of the keys changed by `--set`."""
     return dict(summary.get("overrides") or {})
 
 
 def preset_of_run(summary: Mapping[str, Any]) -> str | None:
-    """Return the name of the preset that the run applied to its scene; None: no preset."""
+    """Return the preset of a run; None without one."""
     preset = summary.get("preset") or {}
     return preset.get("name")
 
@@ -245,8 +242,7 @@ def _scene_of(summary: Mapping[str, Any]) -> "Scene":
 def raised_in(error: BaseException) -> str | None:
     """Return the plug-in that raised an error, with the line of its code; None: no plug-in.
 
-    Calls of other packages, such as NumPy, are ignored. The deepest of the remaining calls raised
-    the error.
+    Calls of other packages, such as NumPy, are ignored; the deepest remaining one raised it.
     """
     plug_ins = {
         point.value.partition(":")[0].partition(".")[0]: f"{kind} '{point.name}'"

@@ -1,11 +1,11 @@
 """Known errors of the contact models, and their limits for mobile bearings.
 
-An error is relative to a converged reference. The stored value is the largest error over the
-measured cases, widened for the number of pairs of bodies. It is no bound for other cases. The cases
-are those of the trade-off study and half of the pairs of `scripts/measure/error_cases.py`. The
-other half is held out. It tests the share of new errors below the stored ones
-(docs/known_errors.md). `scripts/make/tradeoff_table` writes `run/known_errors.json`. An error is
-stated only within the range of its pairs; outside, and for other settings, it is "not measured".
+An error is relative to a converged reference: the largest over the measured cases, widened for the
+number of pairs of bodies, but no bound for other cases. The cases are those of the trade-off study
+and half of the pairs of `scripts/measure/error_cases.py`. The other half is held out and tests the
+share of new errors below the stored ones (docs/known_errors.md). `scripts/make/tradeoff_table`
+writes `run/known_errors.json`. An error is stated only within the range of its pairs; outside, and
+for other settings, it is "not measured".
 """
 
 import json
@@ -41,7 +41,7 @@ FACET_REACH = 2.0 * MILLIMETRE
 
 NOT_MEASURED = "not measured"
 SAME_ANSWER = ("cache",)
-"""Options that change the computing time of a result, but not the result."""
+"""Options that change the computing time of a result only."""
 
 
 @dataclass(frozen=True)
@@ -50,9 +50,6 @@ class KnownError:
 
     Args:
         force: error of a condyle's force, relative to the load; None: no case has two condyles.
-        mean_pressure: error of a condyle's mean pressure.
-        peak_pressure: error of a condyle's peak pressure.
-        area: error of a condyle's contact area.
         situations: place of the contact ("interior", "flank", "edge") -> quantity -> largest error
             at that place. Contacts with a flag that is not about the edge are excluded.
         covered: share of the errors on held-out pairs below the stored errors; None: no pair was
@@ -117,11 +114,9 @@ class ContactSituation:
         poisson_ratio: float,
         facet_sag: float = 0.0,
     ) -> "ContactSituation":
-        """Return the situation of the run's frame of largest peak pressure.
+        """Return the situation of the frame of largest peak pressure.
 
         Args:
-            status: status of each frame.
-            poisson_ratio: of the insert.
             facet_sag: m, sag of the facets of both meshes.
         """
         peaks = np.nan_to_num([columns[f"{side}_peak_pressure_MPa"] for side in SIDES])
@@ -141,7 +136,7 @@ def _share(sag: float, approach: float) -> float:
 
 
 def setting_label(model: str, options: Mapping[str, Any]) -> str:
-    """Return the label of a setting in the trade-off study: name and options of the model."""
+    """Return a setting's label in the trade-off study: the model's name and options."""
     text = ",".join(f"{key}={value}" for key, value in options.items() if key not in SAME_ANSWER)
     return f"{model}[{text}]" if text else model
 
@@ -184,7 +179,7 @@ def stated_error(
 
 
 def _outside(error: KnownError, contact: ContactSituation) -> str:
-    """Return why an error does not apply to a contact; "" if it does."""
+    """Return why an error does not apply to a contact, or ""."""
     # only where contact is modelled
     from tkamb.contact.flags import unmeasured_flags
 
@@ -210,7 +205,7 @@ def _outside(error: KnownError, contact: ContactSituation) -> str:
 
 
 def _within(low: float, value: float, high: float) -> bool:
-    """Return whether a value lies in a range, or is equal to an end in the three digits shown."""
+    """Return whether a value lies in a range, or equals an end in the three digits shown."""
     return value == value and float(f"{low:.3g}") <= float(f"{value:.3g}") <= float(f"{high:.3g}")
 
 
@@ -223,19 +218,15 @@ _RANGES = {
 def known_error(
     model: str, resolution_mm: float, material: str, options: Mapping[str, Any] | None = None
 ) -> KnownError | None:
-    """Return the known error of a setting; None: not measured.
-
-    Args:
-        model: name of the contact model. Plug-ins were not measured.
-        resolution_mm: spacing of the map points, mm. Only the spacings of the study were measured.
-        material: material of the insert. Polyethylene and polyethylene-linear were measured.
+    """Return the known error of a setting; None: not measured, as plug-ins, other spacings than the
+    study's and materials but polyethylene and polyethylene-linear.
     """
     label = setting_label(model, options or {})
     return known_errors().get((label, float(resolution_mm), material))
 
 
 def left_out(model: str, bearing: str) -> tuple[str, ...]:
-    """Return sentences on features of a bearing ("fixed", "mobile") that a contact model lacks."""
+    """Return sentences on what a contact model lacks of a bearing."""
     from tkamb.contact.registry import contact_class  # only where contact is modelled
 
     if bearing == "fixed" or contact_class(model).mobile_bearing:
@@ -244,14 +235,14 @@ def left_out(model: str, bearing: str) -> tuple[str, ...]:
 
 
 def as_json(error: KnownError | str | None) -> dict[str, Any] | str:
-    """Return the value of the key `known_error` in summary.json and `tkamb press --json`."""
+    """Return `known_error` of summary.json and `tkamb press --json`."""
     if isinstance(error, str):
         return error
     return NOT_MEASURED if error is None else asdict(error)
 
 
 def known_error_words(error: Mapping[str, Any] | str, names: Iterable[str]) -> str:
-    """Return full sentences on the known errors of some quantities."""
+    """Return sentences on the known errors of some quantities."""
     if isinstance(error, str):
         return f"The error of this setting of the contact model is {error}."
     names = list(names)
@@ -271,7 +262,7 @@ def known_error_words(error: Mapping[str, Any] | str, names: Iterable[str]) -> s
 
 
 def short_error_words(error: Mapping[str, Any] | str, names: Iterable[str]) -> str:
-    """Return one sentence on the known errors that refers to the report's conclusions."""
+    """Return one sentence that refers to the report's conclusions."""
     if isinstance(error, str):
         return known_error_words(error, names)
     return (
@@ -291,8 +282,7 @@ _PLACES = {"interior": "in the interior", "flank": "on a flank", "edge": "at an 
 def is_large(error: Mapping[str, Any] | str, names: Iterable[str]) -> bool:
     """Return whether the known error of any of the quantities exceeds `notable_share`.
 
-    Contact at an edge has a flag of its own. Where situations were measured, only interior and
-    flanks count.
+    Contact at an edge has a flag of its own: measured situations count without it.
     """
     if isinstance(error, str):
         return False

@@ -32,7 +32,6 @@ class Peak:
     """The largest value of a quantity.
 
     Args:
-        value: value in the unit of the column.
         side: "medial" or "lateral"; "" for a column without sides.
     """
 
@@ -61,10 +60,7 @@ def peak(results: "Results", column: str) -> Peak | None:
 
 
 def doubt_of_peak(results: "Results", side: str, frame: int) -> str:
-    """Return why the peak pressure of a condyle in a frame is uncertain; "" if it is not.
-
-    The reasons come from the flags in the status of the frame.
-    """
+    """Return why a condyle's peak pressure is uncertain, by the frame's flags; "" if it is not."""
     from tkamb.contact.flags import AT_EDGE, TOO_NARROW
 
     doubts = {
@@ -110,8 +106,8 @@ def split_undetermined(results: "Results") -> NDArray[np.bool_]:
 def moved_per_half_degree(results: "Results") -> Array:
     """Return the force (f,), N, that 0.5 deg of adduction shifts between the condyles.
 
-    The force is linear in the angle and at most the force of the more loaded condyle. It is NaN if
-    only one condyle is loaded, since the slope changes when the other condyle touches.
+    It is linear in the angle, at most the more loaded condyle's force, and NaN with one loaded
+    condyle, because the slope changes when the other touches.
     """
     share = medial_share(results, "deformation")
     shift = 0.5 * np.abs(results["medial_force_per_adduction_N_per_deg"])
@@ -144,10 +140,8 @@ def residual_share(results: "Results") -> Array:
 
 
 def residual_effect(results: "Results") -> Array:
-    """Return the sensitivity of the total force to the height of the residuals (f,).
-
-    It is the change of the total force if the residuals act 10 mm higher or lower, over the
-    superior-inferior contact force.
+    """Return the change (f,) of the total force if the residuals act 10 mm higher or lower, over
+    the superior-inferior contact force.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         return results["residual_sensitivity_N"] / np.abs(results["force_si_N"])
@@ -160,7 +154,7 @@ def failed(results: "Results") -> NDArray[np.bool_]:
 
 
 def flagged(results: "Results") -> NDArray[np.bool_]:
-    """Return a mask (f,) of the frames with numbers and a status other than "ok"."""
+    """Return a mask (f,) of frames with numbers and a status other than "ok"."""
     return ~_clean(results) & ~failed(results)
 
 

@@ -79,12 +79,9 @@ class PressReport:
     Args:
         resolution_mm: spacing of the map points, mm.
         nodes: number of nodes of lattice or mesh; of map points for a model without nodes.
-        load: load, N.
         result: contact result in the insert frame (mirrored for a left knee).
         adjustment: femoral adjustment before contact; None: without.
         triangles: indices of neighbouring map points, (k, 3).
-        prepare_seconds: computing time of the preparation, s.
-        solve_seconds: computing time of the press, s.
         peak_rss_MB: largest resident memory of the process, MB.
         known_error: known error of the contact model at this resolution, or "not measured" with
             the reason.
@@ -119,7 +116,7 @@ class PressReport:
     def write_map(self, path: Path) -> None:
         """Write the pressure map as .vtp: metres, insert frame, z to the subject's right.
 
-        The map of a left knee is mirrored back to the side of the given meshes.
+        A left knee's is mirrored back to the side of the given meshes.
         """
         from tkamb.io.mesh_files import write_triangles
 
@@ -426,11 +423,10 @@ def load_pair(
 
 
 def mesh_pose(pose: Sequence[float] | None, units: str, rotation: Array) -> Array:
-    """Return the pose (4, 4) of the femoral mesh in the insert's mesh, in anatomical axes.
+    """Return the pose (4, 4) of the femoral mesh in the insert's, in anatomical axes.
 
     Args:
         pose: x, y, z (units), rx, ry, rz (deg, intrinsic x-y-z) in mesh axes; None: identity.
-        units: unit of length.
         rotation: rotation from mesh to anatomical axes, (3, 3).
     """
     if pose is None:

@@ -43,8 +43,7 @@ class SharedState:
 
     Args:
         muscles: muscles of [muscles], possibly with other strengths than the nominal ones.
-        extensor: extensor mechanism of the nominal case. Its patella is the initial guess for the
-            patella of the sample.
+        extensor: extensor mechanism of the nominal case, whose patella is the initial guess.
         frames: frames with a search for the patella. Other frames keep the nominal pose.
     """
 
@@ -91,7 +90,7 @@ def recording_of(
     split_sensitivity: bool = True,
     cam: "CamPost | None" = None,
 ) -> Recording:
-    """Return the knee of a case in the frames of its motion. The contact is not prepared here.
+    """Return the knee of a case in the frames of its motion, with a contact that is not prepared.
 
     Args:
         shared: state of the nominal case, for a sample; None: the case is no sample.
@@ -163,7 +162,6 @@ def link_poses(case: Case, poses: Array, extensor: "ExtensorFrames | None") -> d
 
     Args:
         poses: recorded pose_femur_in_insert, (f, 4, 4).
-        extensor: patella in all frames; None: not modelled.
     """
     chain, ligament = case.chain, case.patellar_ligament
     shank = np.broadcast_to(inverse(chain.insert_in_tibia), poses.shape)

@@ -74,9 +74,6 @@ def compare_measured(
 
     Pearson's r and the peaks. The frames are counted as compared, failed, without measurement, or
     without prediction (not failed, but NaN).
-
-    Args:
-        body_weight: body weight, N.
     """
     failed = np.array([status.startswith(FAILED) for status in columns["status"]], bool)
     missing = np.full(len(failed), np.nan)
@@ -106,7 +103,7 @@ def _frame_counts(predicted: Array, measured: Array, failed: NDArray[np.bool_]) 
 def _force_errors(
     time: Array, predicted: Array, measured: Array, body_weight: float
 ) -> dict[str, float]:
-    """Return the errors over the compared frames. R² and r are NaN for constant forces."""
+    """R² and r are NaN for constant forces."""
     compared = np.isfinite(predicted) & np.isfinite(measured)
     if not compared.any():
         return {}
@@ -134,7 +131,7 @@ def compare_emg(envelopes: "Envelopes", columns: Mapping[str, Any]) -> dict[str,
 
     The agreement is Pearson's r and RMSE of a(t) and e(t), and the lag L with the largest r of a(t)
     and e(t - L). The lag is positive if the activation is later than the envelope. It uses frames
-    with an envelope for all `LAGS`, and is NaN if r is largest at the first or last lag.
+    with an envelope for all `LAGS`, and is NaN at the first or last lag.
     """
     time = np.asarray(columns["time_s"])
     result = {}
@@ -161,8 +158,8 @@ def fitted_normalisation(
 ) -> dict[str, float | None]:
     """Return EMG channel -> normalising value for which its envelope fits the activations best.
 
-    With the current normalising value v, the value is v / s. The scale s = Σ a e / Σ e² minimises
-    Σ (a - s e)² over frames and muscles of the channel. None: s is not positive.
+    It is v / s with the current value v, and the scale s = Σ a e / Σ e² that minimises Σ (a - s e)²
+    over frames and muscles of the channel. None: s is not positive.
 
     Args:
         columns: columns of results.csv of a run without guidance by EMG.
@@ -195,7 +192,7 @@ def _correlations(a: Array, rows: Array) -> Array:
 
 
 def _lag(envelopes: "Envelopes", muscle: str, time: Array, activation: Array) -> float:
-    """Return the lag, s, of the largest correlation; NaN without a maximum inside the range."""
+    """Return the lag, s, of the largest correlation; NaN at an end of the range."""
     shifted = envelopes.at(muscle, time - LAGS[:, None])
     finite = np.isfinite(shifted).all(axis=0)
     r = _correlations(activation[finite], shifted[:, finite])
@@ -212,11 +209,7 @@ WHY_NOT = {
 
 
 def comparison_words(comparison: Mapping[str, Mapping[str, Any]]) -> tuple[str, str, bool]:
-    """Return the RMSE of the first force, all errors in words, and whether frames are left out.
-
-    Args:
-        comparison: force -> errors from `compare_measured`.
-    """
+    """Return the RMSE of the first force, all errors in words, and whether frames are left out."""
     (_, one), *others = comparison.items()
     counts = [_count_words(one)]
     counts += [f"{n}: {words}" for n, o in others if (words := _count_words(o)) != counts[0]]

@@ -1,13 +1,13 @@
 """Recorders store the finished frames of a run in memory or in the output folder.
 
-In the output folder, each finished frame is written to a file in `.frames` before the next frame
-begins. contact.h5 grows beside these files. Every few seconds it is copied to the output folder,
-together with summary.json and results.csv. There the remaining frames have the status "failed: not
-computed". A resumed run reads the files of the frames. They are removed when all results are
-written. Before the first frame is finished, nothing in the output folder changes.
+In the output folder, each finished frame is a file in `.frames`, and contact.h5 grows beside it.
+Every few seconds it is copied to the output folder, with summary.json and results.csv, in which the
+remaining frames have the status "failed: not computed". A resumed run reads the frames; they are
+removed when all results are written. Before the first frame is finished, nothing in the output
+folder changes.
 
-`.frames` also has a file with the identity of the run. Each frame has a SHA-256 over identity,
-frame number and content. A frame with another SHA-256 counts as absent.
+`.frames` also has the run's identity. Each frame has a SHA-256 over identity, frame number and
+content; one with another SHA-256 counts as absent.
 """
 
 import hashlib
@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 
 
 LARGEST = 2e9
-"""bytes: largest size of a frame. A map of 100,000 points has 5 MB."""
+"""bytes: largest frame; a map of 100,000 points has 5 MB."""
 
 Row = dict[str, Any]
 T = TypeVar("T")
@@ -88,7 +88,6 @@ class Shards:
     """The files of the finished frames.
 
     Args:
-        identity: identity of the run, name -> text or numbers.
         resume: whether to continue an earlier run with the same identity. Otherwise its frames are
             removed when the first frame is written.
         name: name of the folder of the frames in the output folder.
@@ -185,11 +184,9 @@ def completed(
     keep: Callable[[int, T], None] | None,
     total: str,
 ) -> dict[int, T]:
-    """Return the stored and the new answers of all jobs.
+    """Return the stored (`done`) and the new answers, by number of the job.
 
     Args:
-        done: number of a job -> stored answer.
-        answers: numbers and answers of the other jobs.
         keep: function that stores an answer; None: answers are not stored.
         total: number and name of all jobs, like "256 samples".
 
@@ -256,12 +253,11 @@ class Recorder:
     def begin_maps(
         self, name: str, points: Array, triangles: Array, labels: Mapping[str, Any]
     ) -> None:
-        """Prepare to record pressure maps. A run without contact does not call it.
+        """Prepare to record pressure maps, in a run with contact.
 
         Args:
             points: map points, m, (n, 3).
             triangles: indices of neighbouring map points, (k, 3).
-            labels: attributes of contact.h5.
         """
         from tkamb.run.maps import MapWriter
 
@@ -273,7 +269,6 @@ class Recorder:
         """Store a finished frame.
 
         Args:
-            row: column of results.csv -> value.
             contact: arrays of the contact result (`frame_arrays`); None: contact failed or is not
                 modelled.
         """
@@ -287,29 +282,25 @@ class Recorder:
                 writer.append_failed(time)
 
     def take_earlier(self, frames: range) -> dict[int, dict[str, Array] | None]:
-        """Read the finished frames of an earlier run; return frame -> arrays of its contact."""
+        """Read an earlier run's finished frames; return frame -> arrays of its contact."""
         return {}
 
     keeps_files = False
     """Whether finished frames are stored in files."""
 
     def due(self) -> bool:
-        """Return whether it is time to publish the results of the finished frames."""
+        """Return whether it is time to publish."""
         return False
 
     def publish(self, make_results: "Callable[[], Results]") -> "Results":
-        """Write the results of the finished frames to the output folder, and return them.
-
-        Args:
-            make_results: function that returns the results.
-        """
+        """Write the results of the finished frames to the output folder, and return them."""
         return make_results()
 
     def finish(self) -> None:
         """Close the maps after the last frame."""
 
     def maps(self, name: str) -> "ContactMaps | None":
-        """Return the pressure maps of the finished frames, of a file in `MAPS`; None: not begun."""
+        """Return the finished frames' maps of a file in `MAPS`; None: not begun."""
         writer = self._writers.get(name)
         return None if writer is None else writer.maps
 
@@ -324,11 +315,10 @@ class Recorder:
 class FolderRecorder(Recorder):
     """Stores the finished frames of a run in its output folder.
 
-    Nothing in the folder changes before the first frame is finished.
+    It does not change before the first frame is finished.
 
     Args:
         directory: folder that this process has claimed (`tkamb.io.claim`).
-        resume: whether to continue an earlier run in the folder.
     """
 
     def __init__(self, directory: Path, identity: Mapping[str, Any], resume: bool) -> None:
@@ -342,11 +332,11 @@ class FolderRecorder(Recorder):
     def begin_maps(
         self, name: str, points: Array, triangles: Array, labels: Mapping[str, Any]
     ) -> None:
-        """See `Recorder`. The file is created with the first frame."""
+        """See `Recorder`; the file is created with the first frame."""
         self._map_arguments[name] = (points, triangles, labels)
 
     def take_earlier(self, frames: range) -> dict[int, dict[str, Array] | None]:
-        """See `Recorder`. Only frames before the first absent frame are read."""
+        """See `Recorder`; only frames before the first absent one are read."""
         shards = {}
         for frame in frames if self._shards.resumed else ():
             shard = self._shards.get(frame)
@@ -357,7 +347,7 @@ class FolderRecorder(Recorder):
         return shards
 
     def record(self, frame: int, row: Row, contact: dict[str, Array] | None) -> None:
-        """See `Recorder`. An interrupt is delayed until the frame is written."""
+        """See `Recorder`; an interrupt is delayed until the frame is written."""
         with interrupt_later():
             self._shards.put(frame, Shard(row, contact))
             self._record(frame, row, contact)
@@ -425,7 +415,7 @@ def interrupt_later() -> Iterator[None]:
 
 
 def finished_results(directory: Path, identity: Mapping[str, Any]) -> "Results | None":
-    """Return the complete results of a run in a folder; None: none, or not all frames."""
+    """Return a run's complete results in a folder; None: none, or not all frames."""
     settle(directory)
     if not os.path.exists(directory / SUMMARY_NAME):
         return None

@@ -1,8 +1,8 @@
 """A knee in the frames of a recorded motion: each frame as an instant, and what runs store of it.
 
-`frame_arrays` returns the arrays of a frame's contact that the results folder stores. A resumed run
-takes its initial guess from them (`Recording.recalled`). They do not include the displacements of
-the lattice: a resumed run differs from a single one within the tolerance of the solver.
+A resumed run takes its initial guess from the stored arrays of contact (`frame_arrays`,
+`Recording.recalled`), which lack the displacements of the lattice: it differs from a single run
+within the tolerance of the solver.
 """
 
 import time as clock
@@ -75,9 +75,7 @@ class Recording:
     Args:
         method: how a frame of the knee, which is that of a right leg, is computed.
         ground: ground reaction; None: not measured.
-        extensor: patella in all frames; None: not modelled.
-        muscles: muscles of [muscles]; None: the quadriceps is the only muscle.
-        strains: name of a ligament bundle -> strains at some flexions, for the summary.
+        muscles: muscles of [muscles]; None: the quadriceps alone.
 
     Attributes:
         poses: recorded pose_femur_in_insert, (f, 4, 4).
@@ -152,11 +150,7 @@ class Recording:
         return replace(frame, seconds=frame.seconds + seconds)
 
     def frame(self, k: int, before: Sequence[FrameStart] = ()) -> Frame:
-        """Return loads and contact of frame k.
-
-        Args:
-            before: starts of the earlier frames, for warm start and initial guess.
-        """
+        """Return loads and contact of frame k."""
         began, instant = clock.perf_counter(), self.instant(k)
         seconds = clock.perf_counter() - began
         frame = self.method.frame(instant, before)
@@ -182,7 +176,6 @@ class Recording:
         """Return the initial guess that a stored frame gives to the next one.
 
         Args:
-            k: index of the stored frame.
             arrays: result of `frame_arrays`; None: the frame had no contact.
         """
         contact = self.knee.contact
@@ -211,9 +204,9 @@ class Recording:
 
 
 RESULT_ARRAYS = ("pose", "pressure", "gap", "nodal_force")
-"""Arrays of a contact result that pressure maps and warm starts of resumed runs need."""
+"""Arrays of a contact result that maps and warm starts need."""
 BUTTON = "button_"
-"""Beginning of the names of the same arrays of the button's contact."""
+"""Beginning of the same arrays' names for the button."""
 CONTACT_PLACES = ("contact_points", "contact_normals")
 """Arrays (3, 3) of contact points, m, and unit normals of medial condyle, lateral condyle and
 patella; NaN without contact."""

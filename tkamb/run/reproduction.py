@@ -1,7 +1,7 @@
 """Reproduction of a run: verification, packs with scene and inputs, and a second computation.
 
-Inputs are recorded under their names relative to the folder of the scene. They therefore are the
-same in every folder and on every machine.
+Inputs are recorded under their names relative to the scene's folder, which are the same on every
+machine.
 """
 
 import os
@@ -50,7 +50,7 @@ studied. Measured on one x86 processor against a run with one thread, largest of
     knee bend, foundation, adduction released, 5 frames: two threads 0, Nehalem 2e-12
     gait with all muscles, four coordinates released, 4 frames: two threads 0, others 1e-9"""
 COUNTS = ("iterations", "contact_trials", "coupling_iterations", "condition_number")
-"""Columns that depend on the way of the solver, not on its result."""
+"""Columns that depend on the way of the solver only."""
 
 
 @dataclass(frozen=True)
@@ -72,9 +72,7 @@ class Verdict:
 
 
 def verify_results(directory: str | Path, inputs: str | Path | None = None) -> Verdict:
-    """Compare a folder with the SHA-256 in its summary.json.
-
-    Nothing is written.
+    """Compare a folder with the SHA-256 in its summary.json, without writing.
 
     Args:
         inputs: folder with copies of scene and inputs, at any depth. Default: the folder `inputs`
@@ -134,7 +132,7 @@ def _plug_in_note(model: str, code: str) -> list[str]:
 
 
 def scene_name(summary: Mapping[str, Any]) -> str:
-    """Return the file name of the scene of a run."""
+    """Return the file name of a run's scene."""
     if not summary.get("scene"):
         hint = "write the scene to a file and run it again"
         raise InputError("names no scene file", SUMMARY_NAME, hint)
@@ -144,11 +142,7 @@ def scene_name(summary: Mapping[str, Any]) -> str:
 def inputs_folder(
     directory: Path, summary: Mapping[str, Any], given: str | Path | None = None
 ) -> Path:
-    """Return the folder of the scene of a run, or of its copy.
-
-    Args:
-        given: folder in which to look for a copy of the scene.
-    """
+    """Return the folder of a run's scene, or of its copy below `given`."""
     packed = directory / INPUTS_NAME
     root = packed if given is None and packed.is_dir() else given
     if root is None:
@@ -198,11 +192,7 @@ class Rerun:
 
 
 def rerun(directory: str | Path, inputs: str | Path | None = None) -> Rerun:
-    """Compute a run again and compare all columns with the stored ones.
-
-    Args:
-        inputs: as in `verify_results`.
-    """
+    """Compute a run again and compare all columns with the stored ones."""
     from tkamb.io.scene import load_scene
     from tkamb.run.simulation import simulate
 
@@ -223,7 +213,7 @@ def rerun(directory: str | Path, inputs: str | Path | None = None) -> Rerun:
 
 
 def compared_runs(stored: "Results", again: "Results") -> Rerun:
-    """Return the differences of the columns of two computations of a run."""
+    """Return the differences of two computations of a run, by column."""
     if len(stored) != len(again):
         what = f"has {len(stored)} frames, its scene gives {len(again)}"
         raise InputError(what, "results", "`tkamb verify` names changed inputs")
@@ -245,8 +235,8 @@ def compared_runs(stored: "Results", again: "Results") -> Rerun:
 def pack(directory: str | Path, archive: str | Path) -> int:
     """Write a results folder with its scene and inputs into one zip archive.
 
-    The archive holds the files of the results folder and, in `inputs`, all files that the run read.
-    Their places relative to each other stay, so that the scene finds them.
+    In `inputs` are all files that the run read, at the same places relative to each other, so that
+    the scene finds them.
 
     Returns:
         Number of input files.

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 PERCENTILES = {"p05": 5.0, "p50": 50.0, "p95": 95.0}
-"""Suffix of a column of bands.csv -> percentile of the samples, per cent."""
+"""Suffix in bands.csv -> percentile of the samples, per cent."""
 
 
 # 1: least number of samples. The 5th percentile of 20 samples lies between the two
@@ -168,9 +168,9 @@ def read_bands(path: str | Path) -> dict[str, Array]:
 
 
 def _read_columns(path: Path) -> dict[str, Any]:
-    """Return the columns of a table. Names of earlier releases become the new ones.
+    """Return a table's columns, with the new names for those of earlier releases.
 
-    The rows are read one by one, so that their text is never in memory as a whole.
+    Rows are read one by one, to save memory.
     """
     descriptor = open_regular(path, TABLE_BYTES)
     with undamaged(path), open(descriptor, encoding="utf-8", newline="") as file:

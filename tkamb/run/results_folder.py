@@ -34,14 +34,14 @@ if TYPE_CHECKING:
 FOLDER = ".frames"
 IDENTITY_NAME = "run.json"
 OWN_NAMES = (IDENTITY_NAME, "contact.h5", "button.h5", "*.frame", ".tkamb-*.part")
-"""Patterns of the files in `.frames`. No other file is removed from it."""
+"""Patterns of the files in `.frames`; no other file is removed from it."""
 CSV_NAME, SUMMARY_NAME, REPORT_NAME = "results.csv", "summary.json", "report.html"
 MAPS_NAME, BUTTON_NAME = "contact.h5", "button.h5"
 METADATA_NAME = "results.csv-metadata.json"
 BANDS_NAME, TORNADO_NAME, SAMPLES_NAME = "bands.csv", "tornado.csv", "samples.h5"
 INDICES_NAME = "indices.csv"
 UNCERTAINTY_NAMES = (BANDS_NAME, TORNADO_NAME, SAMPLES_NAME, INDICES_NAME)
-"""Files of an uncertainty study beside the results. New results without a study remove them."""
+"""Files of an uncertainty study, which new results without a study remove."""
 SUMMARY_LIMIT = 256 * MEGABYTE
 """bytes: largest size of summary.json, which has an entry for each failed frame."""
 
@@ -103,10 +103,7 @@ def read_summary(directory: Path) -> dict[str, Any]:
 
 
 def differences(directory: Path, summary: Mapping[str, Any]) -> list[str]:
-    """Return messages on files of a folder that have changed since they were written.
-
-    The list is empty for results of a release without SHA-256.
-    """
+    """Return messages on changed files of a folder; none for a release without SHA-256."""
     messages, recorded = [], summary.get("files")
     if not isinstance(recorded, Mapping):
         return []
@@ -162,8 +159,8 @@ def put_numbers(results: Results, files: Replacement) -> None:
     """Write results.csv, and summary.json with the SHA-256 of the files beside it.
 
     Args:
-        files: replacement of the folder's files. A contact.h5 of the folder is kept if the
-            replacement has none; old files of `UNCERTAINTY_NAMES` are removed.
+        files: replacement of the folder's files, whose contact.h5 is kept if it has none, unlike
+            old files of `UNCERTAINTY_NAMES`.
     """
     write_rows(files.path(CSV_NAME), csv_rows(results.columns))
     write_synced(files.path(METADATA_NAME), table_metadata(results.columns, results.summary))
@@ -212,7 +209,7 @@ def _put_maps(maps: "ContactMaps | None", name: str, files: Replacement) -> None
 
 
 def remove_shards(directory: Path, name: str = FOLDER) -> None:
-    """Remove the files of the finished frames, beginning with the identity of their run."""
+    """Remove the finished frames' files, the identity of their run first."""
     folder = directory / name
     if folder.is_symlink():
         return
@@ -233,7 +230,7 @@ UNITS = {
     "Nm": "N·m",
     **{unit: unit for unit in ("N", "mm", "MPa", "deg", "s", "BW")},
 }
-"""End of a column's name -> its unit. Longer ends come first."""
+"""End of a column's name -> its unit, longer ends first."""
 DATATYPES = {"text": "string", "integer": "integer"}
 
 

@@ -51,11 +51,10 @@ class FrameSolver:
     """Computes the frames of a case.
 
     Args:
-        frames: frames to compute; None: all.
-        slips: slips from another solver of this case; None: they are computed.
+        slips: side -> rolling and slip of a condyle in the recorded motion, perhaps from another
+            solver of this case; None: they are computed.
 
     Attributes:
-        slips: side -> rolling and slip of a condyle in the recorded motion.
         before: starts of earlier frames, the initial guesses for the next frame.
 
     Raises:
@@ -84,7 +83,7 @@ class FrameSolver:
         return k, frame_row(self._case, k, frame, self.slips, status), frame_arrays(frame)
 
     def _keep(self, frame: "Frame") -> None:
-        """Store the start. Only the last one of a contact has a warm start, which is large."""
+        """Store the start; only the last one of a contact has a warm start, which is large."""
         if frame.contact is not None:
             self.before = [replace(each, contact=None) for each in self.before]
         self.before.append(frame.next)
@@ -107,10 +106,8 @@ def _without_warnings() -> Iterator[None]:
 
 
 class ChunkSolver:
-    """Solver of a worker process. It reads the scene once and computes chunks of frames.
-
-    The contact is prepared with the first chunk. By then the parent process has prepared its
-    contact, and a cache has the parts that take long.
+    """Solver of a worker process, which reads the scene once. The contact is prepared with the
+    first chunk, when the parent process has prepared its own and filled a cache.
     """
 
     @_without_warnings()
@@ -131,7 +128,7 @@ def finished_in_order(
     """Yield frames from worker processes in their order.
 
     Args:
-        indices: all frames of the run. They determine the chunks.
+        indices: all frames of the run, which determine the chunks.
 
     Raises:
         ComputationError: a worker was killed.
@@ -291,7 +288,7 @@ class _Run:
         return self.recorder.publish(self.results)
 
     def results(self) -> Results:
-        """Return the results. Frames that are not computed yet are failed frames."""
+        """Frames that are not computed yet are failed frames."""
         columns = self.recorder.rows.columns(self.case, self.indices)
         self.seconds["all"] = clock.perf_counter() - self.start
         strains = self.solver.recording.strains
@@ -338,7 +335,7 @@ class _Run:
         self.recorder.begin_maps(name, contact.state.points, contact.state.triangles, labels)
 
     def _take_earlier(self) -> None:
-        """Read the frames of the run to resume. Its last contacts become initial guesses."""
+        """The last contacts of the run to resume become initial guesses."""
         earlier, recording = self.recorder.take_earlier(self.indices), self.solver.recording
         last = list(earlier.items())[-KEPT_CONTACTS:]
         self.solver.before = [recording.recalled(k, arrays) for k, arrays in last]
@@ -412,10 +409,7 @@ def chosen_frames(frames: slice | range | None, count: int) -> range:
 
 
 def _frames_of_range(frames: range, count: int) -> range:
-    """Return an increasing range of frames inside the motion.
-
-    Negative numbers do not count from the end, unlike the ends of a slice.
-    """
+    """Return an increasing range; negative numbers do not count from the end, unlike a slice's."""
     if frames.step < 0 or len(frames) == 0 or frames[0] < 0 or frames[-1] >= count:
         hint = f"it has frames 0 to {count - 1}; a range must increase"
         raise InputError(f"frames {frames} are not in the motion", "frames", hint)

@@ -1,9 +1,9 @@
 """The status of a frame: "ok", the reason of its failure, or flags.
 
-There are two estimates of the medial-lateral split: by deformation (the contact model at the
-recorded rotation), and by coronal equilibrium. A frame is flagged if they differ by much. It is
-flagged too if equilibrium needs a large residual, or if a condyle is loaded by the equations but
-not by the contact model. An input is then wrong or unknown.
+The medial-lateral split has two estimates: by deformation (the contact model at the recorded
+rotation), and by coronal equilibrium. A frame is flagged if they differ by much, if equilibrium
+needs a large residual, or if a condyle is loaded by the equations only: an input is then wrong or
+unknown.
 """
 
 from collections.abc import Sequence
@@ -71,7 +71,7 @@ def contradictions(case: "Case", frame: "Frame") -> list[str]:
 
 
 def share_by_deformation(frame: "Frame") -> float:
-    """Return medial / (medial + lateral) of the contact model; NaN without load."""
+    """Return the medial share of the contact model; NaN without load."""
     result = frame.contact
     if result is None:
         return NAN
@@ -79,7 +79,7 @@ def share_by_deformation(frame: "Frame") -> float:
 
 
 def share_by_equilibrium(frame: "Frame") -> float:
-    """Return medial / (medial + lateral) of the equations; NaN without a solution."""
+    """Return the medial share of the equations; NaN without a solution."""
     return share(normal_force(frame, "medial"), normal_force(frame, "lateral"))
 
 
@@ -99,9 +99,8 @@ def share(medial: float, lateral: float) -> float:
 def split_determined(frame: "Frame") -> float:
     """Return 1 if the recorded adduction determines the split by deformation, else 0.
 
-    It is 0 if 0.5 deg of adduction shifts more than a quarter of the load between the condyles. It
-    is 0 too if one condyle carries the whole load in contrast to equilibrium. NaN: the sensitivity
-    to adduction is unknown.
+    It is 0 if 0.5 deg of adduction shifts more than a quarter of the load, or one condyle carries
+    the whole load in contrast to equilibrium. NaN: unknown.
     """
     if np.isnan(frame.sensitivity):
         return NAN
@@ -124,11 +123,13 @@ class StatusSettings:
     """m: largest translation of a recorded pose by the filter without a flag. The
     error of fluoroscopy is smaller."""
     filter_rotation: float = 0.5 * DEGREE
-    """rad: largest rotation of a recorded pose by the filter without a flag, 0.5 deg.
-    The error of fluoroscopy is smaller."""
+    """rad: largest rotation of a recorded pose by the filter without a flag. The error of
+    fluoroscopy is smaller.
+    """
     flank_angle: float = 20.0 * DEGREE
-    """rad: largest angle of a condyle's contact normal from the vertical without a flag, 20 deg.
-    Steeper contact is on eminence or lip."""
+    """rad: largest angle of a condyle's contact normal from the vertical without a flag. Steeper
+    contact is on eminence or lip.
+    """
     adjusted_total_BW: float = 0.01
     """BW: largest change of the total force by the femoral adjustment without a flag.
     The adjustment should change the split only."""
@@ -214,7 +215,6 @@ def out_of_equilibrium(across: Array | float, normal: Array | float, body_weight
     Args:
         across: patellofemoral force across the button's normal, N.
         normal: patellofemoral force along it, N.
-        body_weight: body weight, N.
     """
     limit = np.maximum(PATELLA_ACROSS * np.abs(normal), PATELLA_LIGHT * body_weight)
     return np.asarray(np.abs(across) > limit)

@@ -67,8 +67,6 @@ def summary_of(
     """Return the content of summary.json (docs/results.md).
 
     Args:
-        seconds: part of the computation -> computing time, s.
-        path: path of the scene file; None: the scene is not from a file.
         strains: ligament bundle -> strains at `STRAIN_FLEXIONS`.
     """
     scene = case.scene
@@ -156,7 +154,7 @@ def measures(case: Case, columns: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _thickness(columns: Mapping[str, Any]) -> dict[str, list[float]]:
-    """Return the range of the insert's thickness below the centres of pressure, mm."""
+    """Return the range of the thickness below the centres of pressure, mm."""
     sides = [columns[f"{side}_thickness_mm"] for side in SIDES]
     thickness = np.concatenate(sides).astype(float)
     thickness = thickness[np.isfinite(thickness)]
@@ -166,7 +164,7 @@ def _thickness(columns: Mapping[str, Any]) -> dict[str, list[float]]:
 
 
 def _tolerances(table: ContactTable) -> dict[str, float]:
-    """Return the relative tolerances of a built-in contact model; empty for a plug-in."""
+    """Return a built-in model's relative tolerances; empty for a plug-in."""
     if table.model in ("foundation", "foundation-linear"):
         from tkamb.contact.pressing import PRESS
 
@@ -211,7 +209,7 @@ def _gait(case: Case) -> dict[str, Any]:
 
 
 def notes_of(scene: Scene) -> list[str]:
-    """Return the notes of the scene, without those on missing [muscles] if the scene has them."""
+    """Return the scene's notes, without those on missing [muscles] if it has them."""
     return [
         note
         for note in scene.output.notes
@@ -312,7 +310,7 @@ def _marker_facts(case: Case) -> dict[str, Any]:
 
 
 def reserves(columns: Mapping[str, Any]) -> dict[str, dict[str, float]]:
-    """Return coordinate -> largest reserve, and number of frames with a large reserve."""
+    """Return coordinate -> largest reserve, and frames with a large one."""
     result = {}
     for column in columns:
         if not belongs(column, RESERVE):
@@ -332,7 +330,7 @@ def reserves(columns: Mapping[str, Any]) -> dict[str, dict[str, float]]:
 
 
 def saturated_muscles(columns: Mapping[str, Any]) -> dict[str, int]:
-    """Return saturated muscle -> number of frames in which it is saturated."""
+    """Return saturated muscle -> number of frames."""
     result = {}
     for column, values in columns.items():
         if belongs(column, ACTIVATION):
@@ -343,7 +341,7 @@ def saturated_muscles(columns: Mapping[str, Any]) -> dict[str, int]:
 
 
 def _first_wrapping(columns: dict[str, Any]) -> float | None:
-    """Return the least flexion, deg, at which the quadriceps wraps; None: it never wraps."""
+    """Return the least flexion, deg, of a wrapping quadriceps, or None."""
     flexion = columns["flexion_deg"][columns["quadriceps_wrap_deg"] > 0.0]
     return float(flexion.min()) if len(flexion) else None
 

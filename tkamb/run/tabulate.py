@@ -50,7 +50,7 @@ WHY_IT_FAILED = (
     *("body_seconds", "query_seconds", "contact_seconds", "condition_number", "contact_trials"),
     *("coupling_iterations", "smallest_stiffness_N_per_mm"),
 )
-"""Columns of a failed frame with numbers. They show how far the frame was computed."""
+"""Columns of a failed frame with numbers, which show how far it was computed."""
 
 Columns = dict[str, Any]
 
@@ -68,7 +68,6 @@ def frame_row(
 
     Args:
         slips: side -> slip in the frames up to k + 1, see `Recording.slips`.
-        status: status of the frame.
     """
     motion = _motion_row(case, k)
     row = motion | _body_row(case, frame)
@@ -230,9 +229,7 @@ def _muscle_row(share: "MuscleShare") -> dict[str, float]:
 def _slip_row(
     case: Case, k: int, side: str, slip: "CondyleSlip", contact: "CondylePoint | None"
 ) -> dict[str, float]:
-    """Return slip and velocities of a condyle on the insert.
-
-    - Slip and slip rate, from the arcs between successive lowest points (`tkamb.knee.slip`).
+    """- Slip and slip rate, from the arcs between successive lowest points (`tkamb.knee.slip`).
     - Sliding velocity: forward rigid-body velocity of the femur's contact point relative to the
       insert, minus the part from axial rotation.
     - Normal velocity: relative velocity of that point along the contact normal. It shows by how

@@ -1,12 +1,11 @@
 """Distribution of jobs over worker processes or a Dask cluster.
 
-A worker is a Python process that runs this module. It prepares the task once, reads pickled jobs
-from its standard input, and writes pickled answers to its standard output. It ends when the input
-ends, even if the parent was killed. Unlike multiprocessing, it does not import the calling script.
+A worker is a Python process that runs this module: it prepares the task once, reads pickled jobs
+from standard input, and writes pickled answers to standard output until the input ends, even if the
+parent was killed. Unlike multiprocessing, it does not import the calling script.
 
-Dask is an extra (`pip install 'tkamb[cluster]'`). If a worker of a cluster dies, another one
-repeats its job. The answers do not depend on the worker, since a job is a function of its number
-and content only.
+Dask is an extra (`pip install 'tkamb[cluster]'`). If a cluster's worker dies, another one repeats
+its job. A job is a function of its number and content only, whatever the worker.
 """
 
 import argparse
@@ -94,12 +93,11 @@ def _cluster_answers(
 
 
 _one_at_a_time = threading.Lock()
-"""Lock for the jobs of a worker with several threads, since their shared state is not
-thread-safe."""
+"""Lock for the jobs of a worker with several threads, whose shared state is not thread-safe."""
 
 
 def answer(packed: bytes, number: int, job: Any) -> Any:
-    """Return the answer to a job on a worker of the cluster."""
+    """Answer a job on a worker of the cluster."""
     with _one_at_a_time:
         return _unpacked(packed)(number, job)
 
@@ -125,8 +123,8 @@ class Task:
     """The task of a worker: a preparation, and a function for each job.
 
     Args:
-        make: importable class or function that prepares a worker. It returns the function of the
-            jobs, which takes number and content of a job.
+        make: importable class or function that prepares a worker and returns the function of a
+            job's number and content.
     """
 
     make: Callable[..., Callable[[int, Any], Any]]
@@ -166,7 +164,7 @@ class PoolOptions:
             check_cluster(self.dask)
 
     def answers(self, task: Task, tasks: Sequence[Numbered]) -> Iterator[Numbered]:
-        """Yield the numbers and answers of jobs in the order in which they finish.
+        """Yield numbers and answers in the order in which the jobs finish.
 
         Raises:
             ComputationError: a worker was killed, or the scheduler has ended.
@@ -176,7 +174,7 @@ class PoolOptions:
 
     @contextmanager
     def team(self, task: Task, count: int) -> Iterator["WorkerPool"]:
-        """Provide a pool of workers, which begin to prepare at once in the background."""
+        """Provide a pool of workers, which prepare at once in the background."""
         processes = self.dask is None and self.workers > 1 and count > 1
         team = WorkerPool(self, task, min(self.workers, count) if processes else 0)
         try:
@@ -224,7 +222,7 @@ class WorkerPool:
         return answer
 
     def answers(self, tasks: Sequence[Numbered]) -> Iterator[Numbered]:
-        """Yield the numbers and answers of jobs in the order in which they finish.
+        """Yield numbers and answers in the order in which the jobs finish.
 
         Raises:
             InputError: the preparation of a worker fails.
@@ -266,7 +264,7 @@ def _send(stream: IO[bytes], value: object) -> None:
 
 
 def serve() -> None:
-    """Answer jobs from standard input until it ends. Printed text goes to standard error."""
+    """Answer jobs from standard input; printed text goes to standard error."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     open_streams()
     log_to_stderr()
@@ -297,7 +295,7 @@ def _known(error: Exception) -> TkambError:
 
 
 def _prepared(task: Task) -> Callable[[int, Any], Any]:
-    """Return the function of the jobs. If the preparation fails, each job raises its error."""
+    """If the preparation fails, each job raises its error."""
     try:
         return task.prepared()
     except Exception as error:

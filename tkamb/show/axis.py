@@ -55,8 +55,8 @@ class HorizontalAxis:
     def stops(self, count: int) -> NDArray[np.int64]:
         """Return about `count` frames spread evenly over the motion, in time order.
 
-        They are evenly spaced in time if flexion is the axis and not monotonic. Otherwise they
-        are the frames nearest to round values of the axis.
+        They are the nearest to round values of the axis, or evenly spaced in time on a flexion axis
+        that is not monotonic.
         """
         x = self.values
         steps = np.diff(x)
@@ -86,8 +86,8 @@ def round_step(step: float) -> float:
 def horizontal_axis(results: "Results", kind: str | None = None) -> HorizontalAxis:
     """Return the horizontal axis of kind `kind`; None: the kind in the summary, else flexion.
 
-    A cycle axis uses the column `cycle_percent`. Without this column, 0 and 100 % are the times
-    `cycle_percent_s` of the summary, or the ends of the motion.
+    A cycle axis uses `cycle_percent`, or the summary's `cycle_percent_s`, or the ends of the motion
+    as 0 and 100 %.
     """
     kind = kind or results.summary.get("axis") or "flexion"
     if kind == "flexion":
@@ -108,7 +108,7 @@ def horizontal_axis(results: "Results", kind: str | None = None) -> HorizontalAx
 
 
 def _stances(results: "Results", start: float, end: float) -> tuple[tuple[float, float], ...]:
-    """Return begin and end of the measured stances, limited to `start` and `end`, s."""
+    """Return begin and end of the measured stances, within `start` and `end`, s."""
     stance = (results.summary.get("gait") or {}).get("stance_s") or ()
     cut = [(max(float(on), start), min(float(off), end)) for on, off in stance]
     return tuple((on, off) for on, off in cut if on < off)
@@ -126,9 +126,8 @@ def _stances_in_cycle(results: "Results") -> tuple[tuple[float, float], ...]:
 
 
 def shown_frames(results: "Results") -> NDArray[np.int64]:
-    """Return the frames that a page shows: all, or `EVENLY_SHOWN` and those of the largest values.
-
-    The largest absolute value of every column is then in the plots, too.
+    """Return the frames that a page shows: all, or `EVENLY_SHOWN` and those of every column's
+    largest absolute value.
     """
     count = len(results)
     if count <= EVENLY_SHOWN:

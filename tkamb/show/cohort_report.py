@@ -152,7 +152,7 @@ def _cards(cohort: Cohort, outcomes: Mapping[int, Outcome], groups: Sequence[Gro
 
 
 def _method_cards(cohort: Cohort, outcomes: Mapping[int, Outcome]) -> list[Card]:
-    """Return the measured error of the method for each activity and choice of muscles."""
+    """Return the method's measured error by activity and choice of muscles."""
     scenes = [cohort.runs[n].scene for n, one in outcomes.items() if not one.reason]
     cases = dict.fromkeys((one.output.activity, one.muscles is not None) for one in scenes)
     cards = []
@@ -226,9 +226,8 @@ def _plots(groups: Sequence[Group]) -> Any:
 def _split_into_plots(groups: Sequence[Group]) -> list[tuple[str, dict[str, Group]]]:
     """Return for each plot the label value that its groups share, and its groups by name.
 
-    If there are too many groups for one plot, each plot shows one value of a label. The label is
-    the one with the fewest values that leaves at most `AT_ONCE` groups in a plot. Without such a
-    label the groups are divided in their order.
+    Of too many groups, each plot shows those of one value of the label with the fewest values that
+    leaves at most `AT_ONCE` in a plot, or else so many in their order.
     """
     if len(groups) > AT_ONCE:
         values = {
@@ -245,7 +244,7 @@ def _split_into_plots(groups: Sequence[Group]) -> list[tuple[str, dict[str, Grou
 
 
 def _highest(group: Group, name: str) -> float:
-    """Return the largest mean plus standard deviation of a group over the motion."""
+    """Return the largest mean plus standard deviation."""
     over = spread(group.bins[name])
     return float(np.nanmax(over.mean + np.nan_to_num(over.sd), initial=0.0))
 
@@ -254,7 +253,6 @@ def draw_groups(groups: Mapping[str, Group], name: str, highest: float) -> Figur
     """Return the groups' means of a column over the motion, with one standard deviation.
 
     Args:
-        groups: name in the legend -> group.
         highest: largest value of all plots of the column, which share one vertical scale.
     """
     with settings():
@@ -303,10 +301,9 @@ def _typical(
 ) -> tuple[list[tuple[Group, int]], bool]:
     """Return one run of each group, and whether these runs differ only in the groups' labels.
 
-    Maps of the same subject and trial are easiest to compare. If possible, all runs therefore
-    share the labels that do not define the groups. Among several such sets, the peak forces of the
-    returned one are nearest to the groups' medians. Otherwise each group has the run with its
-    median peak force. Runs without a map are ignored.
+    Maps of the same subject and trial are easiest to compare, so all runs share the labels that do
+    not define the groups if possible, in the set of peak forces nearest to the groups' medians;
+    else each has the run of its median. Runs without a map are ignored.
     """
     peaks = [
         {

@@ -50,7 +50,7 @@ class Pairing:
         return np.where(self.lower < 0, np.nan, np.where(self.weight > 0, between, low))
 
     def nearest(self, frame: int) -> int | None:
-        """Return the other run's frame nearest to a frame of the first; None: not comparable."""
+        """Return the other run's frame nearest to a frame; None: not comparable."""
         if self.lower[frame] < 0:
             return None
         return int((self.upper if self.weight[frame] > 0.5 else self.lower)[frame])
@@ -61,10 +61,9 @@ def pair_frames(
 ) -> Pairing | None:
     """Pair the frames of two runs.
 
-    If every frame of the shorter run has a match at the same time and position on the axis, both
-    runs have the same recording and these frames are paired. Otherwise the other run is
-    interpolated linearly within its range. This needs monotonic axes. For other axes the result is
-    None.
+    If every frame of the shorter run has a match at the same time and position, both have the same
+    recording and these frames are paired; otherwise the other run is interpolated linearly within
+    its range, which needs monotonic axes (None without).
     """
     same = _same_frames(first["time_s"], first_axis.values, other["time_s"], other_axis.values)
     if same is not None:
@@ -87,7 +86,7 @@ def pair_frames(
 def _same_frames(
     first_time: Array, first_place: Array, other_time: Array, other_place: Array
 ) -> Index | None:
-    """Return the matching frames (f,) of the other run, -1: no match; None: other recording."""
+    """Return matching frames (f,), -1: none; None: another recording."""
     at = {float(time): k for k, time in enumerate(other_time)}
     result = np.array([at.get(float(time), -1) for time in first_time], np.int64)
     paired = result >= 0
@@ -117,10 +116,8 @@ MAX_RUNS = 8
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One folder of results.
-
-    Args:
-        pairing: pairing with the frames of the first run; None: frames cannot be paired.
+    """Args:
+    pairing: pairing of a folder with the first run; None: frames cannot be paired.
     """
 
     label: str
@@ -135,7 +132,6 @@ class Difference:
     """Difference of one column: a run minus the first run.
 
     Args:
-        column: name of the column, with its unit.
         max_abs: largest absolute difference.
         percent: largest difference, % of the largest absolute value of the first run; NaN if that
             value is zero.
@@ -157,13 +153,10 @@ class Difference:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Comparison of runs with the first of them.
-
-    Args:
-        runs: at least two runs.
-        kind: kind of the horizontal axis: "flexion", "cycle" or "time".
-        notes: sentences on different settings and on columns that cannot be compared.
-        differences: one per column of each run after the first.
+    """Args:
+    kind: horizontal axis: "flexion", "cycle" or "time".
+    notes: sentences on different settings and on columns that cannot be compared.
+    differences: one per column of each run after the first.
     """
 
     runs: tuple[Run, ...]
@@ -241,10 +234,7 @@ def _labels(paths: Sequence[Path]) -> list[str]:
 
 
 def differences(first: Run, run: Run) -> list[Difference]:
-    """Return the differences of all columns of both runs; empty if no frames can be paired.
-
-    A frame that failed in one run is not compared.
-    """
+    """Return the differences of all common columns, without frames that failed in one run."""
     if run.pairing is None:
         return []
     result = []
@@ -297,7 +287,7 @@ def _notes(runs: Sequence[Run]) -> list[str]:
 
 
 def _unlike_tables(runs: Sequence[Run]) -> list[str]:
-    """Return a sentence for each key of the scenes that differs. [contact] has its own."""
+    """Return a sentence for each differing key, without [contact], which has its own."""
     tables = [_flat(run.results.summary.get("scene_tables") or {}) for run in runs]
     names = dict.fromkeys(name for table in tables for name in table)
     return [
@@ -309,7 +299,7 @@ def _unlike_tables(runs: Sequence[Run]) -> list[str]:
 
 
 def _flat(value: Any, name: str = "") -> dict[str, Any]:
-    """Return dotted key -> value of nested tables. Entries of lists of tables have numbers."""
+    """Return dotted key -> value of nested tables, with numbers in lists of tables."""
     if isinstance(value, list) and any(isinstance(one, dict) for one in value):
         value = {str(one.get("name", k)): one for k, one in enumerate(value)}
     if not isinstance(value, dict):
@@ -319,9 +309,8 @@ def _flat(value: Any, name: str = "") -> dict[str, Any]:
 
 
 def _unlike_inputs(runs: Sequence[Run]) -> list[str]:
-    """Return a sentence for each input file whose content differs.
-
-    A file that only some runs read is in a setting.
+    """Return a sentence for each input file of other content; one that only some runs read is in a
+    setting.
     """
     inputs = [run.results.summary.get("inputs") or {} for run in runs]
     return [
@@ -333,7 +322,7 @@ def _unlike_inputs(runs: Sequence[Run]) -> list[str]:
 
 
 def _unlike(runs: Sequence[Run], words: str, values: Sequence[Any]) -> list[str]:
-    """Return one sentence if the values are not all the same."""
+    """Return one sentence if the values differ."""
     if all(value == values[0] for value in values):
         return []
     if all(isinstance(value, list) for value in values):

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 WIDTH, HEIGHT = 5.4, 2.7
 DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.2, 1.2, 1.2)))
-"""Line styles: runs can be distinguished without colour, and where they coincide."""
+"""Line styles, which distinguish runs without colour and where they coincide."""
 
 
 # 1: distance between the rows of crosses that mark failed frames, as a share of the plot's height.
@@ -39,11 +39,8 @@ FAILED_ROW_HEIGHT = 0.03
 
 @dataclass(frozen=True, eq=False)
 class Quantity:
-    """Quantity of one picture.
-
-    Args:
-        unit: unit of the values.
-        values: function of the results of a run that returns (f,) values.
+    """Args:
+    values: function of a run's results that returns (f,) values, in `unit`.
     """
 
     title: str
@@ -94,8 +91,8 @@ def run_colour(number: int) -> str:
 def draw_quantity(comparison: Comparison, quantity: Quantity) -> Figure | None:
     """Return a plot of one quantity of all runs; None: no run has it, or it is the axis itself.
 
-    Each line is drawn in time order and broken at failed frames. Crosses at the bottom, in the
-    run's colour, mark the failed frames.
+    Lines are in time order and broken at failed frames, which crosses at the bottom mark in the
+    run's colour.
     """
     curves = [quantity.values(run.results) for run in comparison.runs]
     if not any(np.isfinite(values).any() for values in curves):
@@ -129,8 +126,7 @@ def _draw_curve(axes: Axes, number: int, run: Run, values: Array) -> None:
 def shown_frame(comparison: Comparison) -> int:
     """Return the frame of the first run at which maps are shown by default.
 
-    It has the largest contact force among the frames at which most runs have a map. It is 0 if no
-    frame has a force.
+    It has the largest contact force among those with a map of most runs; 0 if no frame has a force.
     """
     force = comparison.runs[0].results["force_total_BW"]
     finite = np.isfinite(force)
@@ -141,7 +137,7 @@ def shown_frame(comparison: Comparison) -> int:
 
 
 def _mapped(run: Run, frames: int) -> Index:
-    """Return an array (f,): 1 if this run has a map at the frame of the first run, else 0."""
+    """Return (f,): 1 if this run has a map at the first run's frame, else 0."""
     if run.pairing is None:
         return np.zeros(frames, np.int64)
     rows = map_rows(run.results)
@@ -167,7 +163,7 @@ def draw_maps(comparison: Comparison, frame: int) -> Figure | None:
 
 
 def _map_at(results: "Results", frame: int) -> Array | None:
-    """Return the pressures (n,) of a frame, MPa; None: the frame has no map."""
+    """Return a frame's pressures (n,), MPa; None without a map."""
     row = map_rows(results).get(frame)
     if results.maps is None or row is None:
         return None
@@ -212,7 +208,7 @@ FIRST = (
     "medial_cop_ap_mm", "lateral_cop_ap_mm", "quadriceps_N", "patellar_ligament_N",
     "patellofemoral_N", "approach_mm",
 )  # fmt: skip
-"""Columns of the table that is printed and that comes first on the page."""
+"""Columns of the printed table, which comes first on the page."""
 
 
 def headline(comparison: Comparison) -> list[Difference]:
@@ -221,7 +217,7 @@ def headline(comparison: Comparison) -> list[Difference]:
 
 
 def check_frame(comparison: Comparison, frame: int | None) -> int:
-    """Return the frame of the first run with shown maps; negative ones count from the end."""
+    """Return the first run's frame with shown maps; negative ones count from the end."""
     count = len(comparison.runs[0].results)
     if frame is None:
         return shown_frame(comparison)

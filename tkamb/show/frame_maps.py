@@ -1,8 +1,7 @@
 """Pressure maps of all frames as one grey picture, for the report's slider.
 
-A byte is `RIM_BYTE` at the edge of contact, larger in contact (255 for the largest
-pressure of the run) and smaller outside. The page interpolates linearly between the bytes and
-colours the contact.
+A byte is `RIM_BYTE` at the edge of contact, larger in contact (255 for the largest pressure of the
+run) and smaller outside. The page interpolates linearly between bytes and colours the contact.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -36,9 +35,8 @@ COARSENING = 2
 
 
 def draw_insert(view: TopView, largest: float) -> Figure:
-    """Return a figure of the bare insert with a colour bar up to `largest`, MPa.
-
-    The page draws the pressure over it.
+    """Return the bare insert with a colour bar up to `largest`, MPa, over which the page draws the
+    pressure.
     """
     with settings():
         figure = new_figure(5.4, 3.7)
@@ -100,9 +98,8 @@ def frame_maps(results: "Results", view: TopView) -> dict[str, Any]:
 def _tiles(
     results: "Results", view: TopView, rows: list[int], largest: float
 ) -> tuple[NDArray[np.uint8], list[float]]:
-    """Return tiles (frames, rows, columns) and their left, right, bottom and top edge, mm.
-
-    Tiles are cropped to the area that is in contact in any frame.
+    """Return tiles (frames, rows, columns), cropped to all contacts, and their left, right, bottom
+    and top edge, mm.
     """
     maps = results.maps
     assert maps is not None
@@ -120,7 +117,7 @@ def _tiles(
 
 
 def _png(tiles: NDArray[np.uint8], across: int) -> str:
-    """Return all tiles side by side as the data address of a grey PNG."""
+    """Return all tiles side by side as a PNG data address."""
     count, rows, columns = tiles.shape
     down = -(-count // across)
     whole = np.zeros((down * across, rows, columns), np.uint8)

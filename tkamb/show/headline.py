@@ -1,6 +1,6 @@
 """The headline of the report: tiles with the main results, and the three lines above them.
 
-`assets/headline.txt` has the words. This module has the numbers.
+`assets/headline.txt` has the words, this module the numbers.
 """
 
 from collections.abc import Callable, Mapping
@@ -53,9 +53,7 @@ class Card:
     """One headline number.
 
     Args:
-        value: the number with its unit.
         sentence: one sentence: place in the motion, or meaning of the number.
-        warning: whether the card is highlighted as a warning.
     """
 
     title: str
@@ -75,7 +73,7 @@ class Card:
 
 
 def run_title(summary: Mapping[str, Any]) -> str:
-    """Return the title in a run's summary, or a title made from the path of its scene."""
+    """Return the title in a summary, or one by the path of its scene."""
     if summary.get("title"):
         return str(summary["title"])
     scene = Path(str(summary.get("scene") or "tkamb run"))
@@ -181,7 +179,7 @@ def _muscles(summary: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def _band(results: "Results") -> dict[str, Any] | None:
-    """Return the band of the peak force, its main causes, and inputs that are not varied."""
+    """Return the peak force's band, main causes, and inputs that do not vary."""
     table, peak = results.summary.get("uncertainty"), metrics.peak(results, "force_total_BW")
     band = results.band("force_total_BW")
     if not table or peak is None or band is None:
@@ -203,7 +201,7 @@ def _band(results: "Results") -> dict[str, Any] | None:
 
 
 def _with_band(results: "Results", name: str, frame: int, scale: float, digits: int) -> str:
-    """Return median and 5 to 95 % of a column at a frame in words, or its nominal value."""
+    """Return median and 5 to 95 % of a column in words, or its nominal value."""
     band = results.band(name)
     if band is None or not np.isfinite(band[:, frame]).all():
         return f"{scale * results[name][frame]:.{digits}f}"
@@ -302,10 +300,8 @@ def _extensor(results: "Results") -> dict[str, Any] | None:
 
 
 def _wraps_from(results: "Results", first: float) -> str:
-    """Return in words the flexion at which the quadriceps begins to wrap the femur.
-
-    Args:
-        first: smallest flexion of a frame in which it wraps, deg.
+    """Return the flexion from which the quadriceps wraps the femur, in words, `first` of a frame,
+    deg.
     """
     flexion, wrap = results["flexion_deg"], results["quadriceps_wrap_deg"]
     last = max(flexion[(wrap == 0.0) & (flexion < first)], default=first)

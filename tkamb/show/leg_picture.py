@@ -1,9 +1,8 @@
 """Pictures of the leg: three frames with the ground reaction, and registered markers.
 
-The rows show the whole leg from the lateral side and from the front, then the knee from both
-directions. The last row names the ligaments. The laboratory's y is up. Forward is the mean
-direction of x of the insert over the three frames. A left knee is mirrored at input and mirrored
-back in the picture.
+The rows show the whole leg from the lateral side and from the front, then the knee likewise; the
+last one names the ligaments. The laboratory's y is up, and forward the mean direction of the
+insert's x over the three frames. A left knee is mirrored at input and mirrored back in the picture.
 """
 
 from collections.abc import Sequence
@@ -70,7 +69,6 @@ class LegFrame:
     """The leg at one frame in the laboratory, m.
 
     Args:
-        frame: frame of the motion.
         joints: centres of hip, knee and ankle, shape (3, 3). The knee is the origin of the insert
             frame.
         lines: ligaments and tendons, each with points (n, 3), its colour and its name.
@@ -91,8 +89,8 @@ class LegFrame:
 def shown_frames(case: Case) -> list[int]:
     """Return three distinct frames in time order, or fewer for a short motion.
 
-    They are the first frame, the frame of the largest ground reaction and the frame of the largest
-    flexion. A frame that is near another one is replaced by the last or the middle frame.
+    They are the first frame and those of the largest ground reaction and flexion; one near another
+    is replaced by the last or the middle frame.
     """
     count = len(case.motion.time)
     frames = [0, int(np.argmax(case.motion.coordinates[:, 5])), count - 1, count // 2]
@@ -135,9 +133,8 @@ def leg_frame(case: Case, recording: Recording, k: int) -> LegFrame:
 
 
 def _lines(recording: Recording, state: ChainState) -> list[tuple[Array, str, str]]:
-    """Return ligaments, muscle and patellar ligament as points in the insert frame, colour, name.
-
-    The name is empty except for the first strand of a ligament.
+    """Return ligaments, muscle and patellar ligament: points in the insert frame, colour, and name
+    of a first strand.
     """
     segments: list[tuple[Array, str, str]] = []
     named: set[str] = set()
@@ -212,7 +209,7 @@ def draw_leg(case: Case, recording: Recording) -> Figure:
 
 
 def _ahead(recording: Recording, k: int) -> Array:
-    """Return the horizontal part (3,) of the insert's x axis in the laboratory frame."""
+    """Return the horizontal part (3,) of the insert's x, laboratory frame."""
     state = recording.geometry(k).state
     return state.insert_in_laboratory[:3, 0] * np.array([1.0, 0.0, 1.0])
 
@@ -262,7 +259,6 @@ def _draw(axes: Axes, one: LegFrame, view: View, weight: float) -> None:
 
 
 def _name_sides(axes: Axes, view: View) -> None:
-    """Label the anatomical directions to the left and to the right of the page."""
     ends = ((0.02, 0.015, "left", view.left), (0.98, 0.05, "right", view.right))
     for place, height, align, words in ends:  # two heights, because labels may overlap
         axes.text(
@@ -283,7 +279,7 @@ def _name_ligaments(axes: Axes, one: LegFrame, view: View) -> None:
 
 
 def _draw_surface(axes: Axes, surface: Surface, view: View, colour: str) -> None:
-    """Draw a surface's triangles, farthest first. Those that face the reader are lightest."""
+    """Draw triangles, farthest first; those that face the reader are lightest."""
     lean = surface.face_normals @ view.towards
     facing = np.flatnonzero(lean > 0)
     corners = surface.triangles[facing]
@@ -341,7 +337,7 @@ def draw_registration(
 
 
 def _straight(links: "Links", segments: "Sequence[ModelSegment]") -> dict[str, Array]:
-    """Return segment -> its pose (4, 4) in the shank of the straight leg."""
+    """Return segment -> pose (4, 4) in the shank of the straight leg."""
     thigh = links.insert_in_tibia @ knee_pose(links.neutral)
     poses = {"shank": np.eye(4), "thigh": thigh}
     for s in segments:

@@ -25,10 +25,9 @@ def pressure_levels(
 ) -> Array:
     """Return levels (f, n) for drawing: positive up to 1 in contact, negative outside.
 
-    The level of a loaded point is its pressure divided by `peak`. The picture interpolates levels
-    linearly, so the drawn contact ends where the level is zero. An unloaded point beside a loaded
-    one has a level proportional to minus its gap. On average the edge then lies halfway between
-    loaded and unloaded points.
+    A loaded point has its pressure divided by `peak`, an unloaded one beside it a level
+    proportional to minus its gap. The picture interpolates linearly, so the drawn contact ends at
+    level zero, on average halfway between loaded and unloaded points.
 
     Args:
         pressure: pressures (f, n), any unit; NaN in failed frames.
@@ -63,7 +62,6 @@ class PageGrid:
 
     Args:
         points: points (n, 3) of the insert's surface, m, insert frame.
-        triangles: (k, 3) indices into the points.
         sign: 1.0: the page's right is insert +z; -1.0: it is insert -z.
         step_mm: distance between neighbouring grid points, mm.
     """
@@ -87,9 +85,8 @@ class PageGrid:
 
     @cached_property
     def _hits(self) -> tuple[NDArray[np.bool_], NDArray[np.int64], Array]:
-        """Mask of grid points on the insert; indices and weights of three points for each of these.
-
-        The mask has the shape (rows, columns), the other two (m, 3).
+        """Mask (rows, columns) of grid points on the insert; indices and weights (m, 3) of three
+        points for each.
         """
         step = self._step
         row = (self.up[0] - self._points[:, 0] / MILLIMETRE) / step
@@ -113,7 +110,6 @@ class PageGrid:
 
         Args:
             values: values (..., n) at the points, one or more fields.
-            every: step between the rows and columns that are returned; 1: all.
         """
         over, corners, weights = self._hits
         chosen = np.zeros(over.shape, bool)
@@ -130,8 +126,8 @@ def touched_part(touched: Mask) -> tuple[slice, slice]:
     """Return the rows and columns of a grid that enclose the contact, with a margin.
 
     Args:
-        touched: mask (rows, columns) of grid points in contact. If it is empty, the result is a
-            few rows and columns at the first corner.
+        touched: mask (rows, columns) of grid points in contact; if it is empty, a few at the first
+            corner are returned.
     """
     rows, columns = (_range(indices) for indices in np.nonzero(touched))
     return rows, columns
@@ -147,10 +143,10 @@ def _covered(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Return all pairs of a triangle and a grid point inside it.
 
-    The arrays hold the triangle's index, the point's flat index and its barycentric weights (3).
+    They are triangle, flat index of the point, and its barycentric weights (3).
 
     Args:
-        corners: corners (k, 3, 2) of the triangles, row and column, in steps of the grid.
+        corners: corners (k, 3, 2) in steps of the grid, row and column.
     """
     first = np.maximum(np.ceil(corners.min(axis=1) - EDGE_TOLERANCE), 0.0).astype(np.int64)
     last = np.minimum(np.floor(corners.max(axis=1) + EDGE_TOLERANCE), np.array(shape) - 1)
@@ -167,6 +163,6 @@ def _covered(
 
 
 def _area(a: Array, b: Array, c: Array) -> Array:
-    """Return twice the signed areas (n,) of triangles of points (n, 2)."""
+    """Return twice the signed areas (n,) of triangles (n, 2)."""
     u, v = b - a, c - a
     return np.asarray(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])

@@ -56,7 +56,7 @@ AXIS_TOP = 1.02
 
 
 CELL, CELLS_ACROSS, MARGIN = (2.16, 1.12), 5, 0.3
-"""Width and height of a small plot, inches; number of plots in a row; height for labels, inches."""
+"""Width and height of a small plot, inches; plots in a row; height for labels, inches."""
 BETWEEN, LABELS = (11.5, 20.0), 10.0
 """Points: smallest horizontal and the vertical distance between small plots; height for axis labels
 above an incomplete last row."""
@@ -70,7 +70,6 @@ class Cell:
     """One small plot of activations.
 
     Args:
-        title: name of the muscle, or of the EMG channel with its number of muscles.
         envelope: name of the muscle whose EMG envelope is drawn; None: no EMG.
     """
 
@@ -126,16 +125,15 @@ def _contributions(results: "Results", side: str) -> Panel:
 
 
 def _sum(results: "Results", family: str, names: tuple[str, ...]) -> Array:
-    """Return the sum (f,) of the existing columns of a family; NaN if none exists."""
+    """Return the sum (f,) of a family's existing columns; NaN without any."""
     columns = [family_column(family, name) for name in names]
     present = [results[name] for name in columns if name in results.columns]
     return np.sum(present, axis=0) if present else np.full(len(results), np.nan)
 
 
 def activation_cells(results: "Results") -> list[Cell]:
-    """Return the small plots: one per muscle of a knee group, and one per EMG channel of others.
-
-    A group is a knee group if one of its muscles crosses the knee.
+    """Return a plot per muscle of a knee group, which crosses the knee, and per EMG channel of
+    others.
     """
     emg: Mapping[str, Any] = (results.summary.get("emg") or {}).get("muscles", {})
     cells: list[Cell] = []
@@ -220,7 +218,7 @@ def _draw_cell(axes: Axes, cell: Cell, results: "Results", axis: HorizontalAxis)
 
 
 def _beyond(results: "Results", cell: Cell) -> str:
-    """Return the largest value of an EMG envelope that exceeds the plot in words; else ""."""
+    """Return the largest EMG envelope beyond the plot in words; else ""."""
     if cell.envelope is None:
         return ""
     envelope = results[family_column(ENVELOPE, cell.envelope)]
@@ -229,7 +227,7 @@ def _beyond(results: "Results", cell: Cell) -> str:
 
 
 def _agreement(results: "Results", cell: Cell) -> str:
-    """Return Pearson's r of activation and envelope in words; for several muscles its range."""
+    """Return Pearson's r of activation and envelope in words, or its range."""
     emg: Mapping[str, Any] = (results.summary.get("emg") or {}).get("muscles", {})
     correlations = [emg[name]["pearson_r"] for name in cell.muscles if name in emg]
     correlations = [r for r in correlations if r is not None and np.isfinite(r)]

@@ -24,7 +24,6 @@ def render(package: str, name: str, **values: Any) -> str:
     """Return the page that a template makes from values.
 
     Args:
-        package: package with the template, for example "tkamb.show".
         values: values of the names in the template. A missing value raises an error.
     """
     pages = environment(package, True)
@@ -33,9 +32,8 @@ def render(package: str, name: str, **values: Any) -> str:
 
 
 def _unbroken(text: str) -> Markup:
-    """Return HTML without line breaks between a number and its unit, or within a range.
-
-    Text between backticks becomes code.
+    """Remove line breaks between number and unit, or within a range; text between backticks becomes
+    code.
     """
     html = re.sub(r"(\d) (%|BW|N|MPa|mm)(?!\w)", "\\1\u00a0\\2", str(escape(text)))
     html = re.sub(r"`([^`]+)`", r"<code>\1</code>", html)
@@ -46,9 +44,6 @@ def policy_sources(*texts: str) -> str:
     """Return the SHA-256 sources of inline scripts or styles for a content security policy.
 
     Line ends count as \\n, as in browsers.
-
-    Args:
-        texts: complete text between the tags of each script or style.
 
     Source: W3C, Content Security Policy Level 3, section 2.3.1.
     """

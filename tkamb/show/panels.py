@@ -43,15 +43,11 @@ LINE_WIDTH_SHARE = 0.005
 
 @dataclass(frozen=True, eq=False)
 class Line:
-    """One curve.
+    """One curve, with a `name` unique in its panel.
 
     Args:
-        name: name of the curve, unique in its panel; often the name of its column.
         values: (f,) values in the unit of the panel.
-        colour: colour of the curve, "#rrggbb".
-        dashed: whether the curve is dashed.
-        band: (3, f) 5th, 50th and 95th percentile of the samples, in the unit of the panel; None:
-            the run has no samples.
+        band: (3, f) 5th, 50th and 95th percentile of the samples; None: there are none.
         wide_band: (2, f) 5th and 95th percentile with the discrepancy of the method; None: unknown.
         behind: whether the curve is drawn broad and pale behind the other curves.
     """
@@ -71,12 +67,10 @@ class Panel:
     """One plot.
 
     Args:
-        unit: unit of the vertical axis.
         level: (value, label) of a horizontal reference line; None: no line.
         span: (low, high, label) of a shaded range behind the curves; None: no range.
         second: (factor, unit) of a second vertical axis on the right; None: no second axis.
         limits: ends of the vertical axis; None: they follow from the curves.
-        warning: whether the note is highlighted as a warning.
     """
 
     name: str
@@ -104,7 +98,7 @@ def panels(results: "Results") -> tuple[Panel, ...]:
 
 
 def _without_empty_lines(panel: Panel) -> Panel:
-    """Return the panel without lines that hold only NaN. Lines over others are dashed."""
+    """Remove lines of NaN only, and dash lines over others."""
     lines = tuple(line for line in panel.lines if np.isfinite(line.values).any())
     return replace(panel, lines=_none_hidden(lines))
 
@@ -118,7 +112,7 @@ def _none_hidden(lines: Sequence[Line]) -> tuple[Line, ...]:
 
 
 def _coincide(values: Array, others: Array) -> bool:
-    """Return whether two curves (f,) coincide in all frames that have both."""
+    """Return whether curves (f,) coincide in all frames of both."""
     finite = np.isfinite(values) & np.isfinite(others)
     if not finite.any():
         return False
@@ -396,7 +390,7 @@ def _ligaments(results: "Results") -> Panel:
 
 
 def _bundle(results: "Results", bundle: str, strands: Sequence[str], position: int) -> Line:
-    """Return the summed tension of strands. It is NaN in frames where all strands are NaN."""
+    """Return the strands' summed tension, NaN where all are NaN."""
     tension = np.array([results[name] for name in strands])
     missing = np.isnan(tension).all(axis=0)
     values = np.where(missing, np.nan, np.nansum(tension, axis=0))

@@ -41,7 +41,7 @@ FOOT, OVERHANG, AXIS_LABEL = 31.5, 13.0, 13.0
 """Points: height of the labels under a plot; half the width of the last tick label; width of the
 label of the vertical axis."""
 SIDE_LABEL, LEGEND = 8.0, 8.5
-"""Points: font sizes of the labels beside a plot and of the legend."""
+"""Points: font sizes of labels beside a plot and of the legend."""
 
 
 # Points: distance of an axis label from the edge of the figure. Chosen by eye.
@@ -64,8 +64,8 @@ STANCE = "#eef3f7"
 class Sheet:
     """A figure on which the plots of a run are drawn one after the other.
 
-    Axes and ticks are reused, because they take most of the time of a plot. A plot that
-    `_place_alone` cannot place has a separate figure.
+    Axes and ticks take most of a plot's time and are reused; a plot that `_place_alone` cannot
+    place has a separate figure.
     """
 
     def __init__(self, results: "Results", axis: HorizontalAxis, width: float = WIDTH) -> None:
@@ -148,10 +148,10 @@ def plot(results: "Results", *names: str, axis: str | None = None) -> Figure:
 
 
 def _place_alone(axes: Axes, panel: Panel) -> bool:
-    """Place the axes of a plot so that its labels fit. Return whether this was possible.
+    """Place the axes of a plot so that its labels fit, and return whether this was possible.
 
-    The result equals matplotlib's constrained layout, which is slow. It is impossible with a power
-    of ten above a vertical axis, or with a legend that is too wide.
+    The result equals matplotlib's slow constrained layout. It is impossible with a power of ten
+    above a vertical axis, or too wide a legend.
     """
     for second in axes.child_axes:
         second.apply_aspect()  # the second axis takes its range from the first
@@ -186,7 +186,7 @@ def _place_alone(axes: Axes, panel: Panel) -> bool:
 
 
 def _legend_width(panel: Panel, columns: int) -> float:
-    """Return the width of the legend made by `legend_above`, points."""
+    """Return the width of the legend by `legend_above`, points."""
     texts = [text_width(line.label, LEGEND) for line in panel.lines]
     rows = -(-len(texts) // columns)
     wide = [max(texts[k : k + rows]) for k in range(0, len(texts), rows)]
@@ -232,7 +232,7 @@ def _draw_lines(axes: Axes, panel: Panel, axis: HorizontalAxis) -> None:
 
 
 def _draw_band(axes: Axes, line: Line, axis: HorizontalAxis) -> None:
-    """Shade a line's band from the 5th to the 95th percentile, and draw its median dotted."""
+    """Shade the 5th to 95th percentile, and draw the median dotted."""
     assert line.band is not None
     (x, low), (_, middle), (_, high) = (axis.broken(one) for one in line.band)
     opacity, name = BAND_OPACITY, f"band-{line.name}"
@@ -289,7 +289,7 @@ def _draw_level(axes: Axes, value: float, label: str) -> None:
 
 
 def _draw_span(axes: Axes, low: float, high: float, label: str) -> None:
-    """Shade a range of values. A range of one value appears as a line."""
+    """A range of one value appears as a line."""
     axes.axhspan(low, high, facecolor=SPAN, edgecolor=SPAN, linewidth=2, zorder=0.5, gid="span")
     middle, transform = 0.5 * (low + high), axes.get_yaxis_transform()
     words = label.replace(" ", "\n", 1)

@@ -59,8 +59,6 @@ class TopView:
     """The insert from above, in page coordinates: mm to the right and up.
 
     Args:
-        maps: pressure maps with their points and triangles.
-        side: side of the knee, "right" or "left".
         lateral: direction of z of the insert frame, "lateral" or "medial".
     """
 
@@ -81,10 +79,10 @@ class TopView:
 
     @cached_property
     def insert_picture(self) -> tuple[Array, Array]:
-        """Return grey level and opacity (rows, columns) of the insert, on a grid with a margin.
+        """Return grey level and opacity (rows, columns) of the insert, with a margin.
 
-        The edge of the map has steps. Its outline is smoothed: the signed distance from the edge is
-        averaged over about one triangle, and the outline is where this average is zero.
+        The steps of the map's edge are smoothed: the outline is where the mean signed distance over
+        about one triangle is zero.
         """
         from scipy.ndimage import distance_transform_edt, gaussian_filter  # takes 0.1 s to load
 
@@ -98,12 +96,12 @@ class TopView:
 
     @property
     def across_limits(self) -> tuple[float, float]:
-        """Return the left and right end of the picture, mm."""
+        """Return the left and right end, mm."""
         return float(self.across.min() - MARGIN_MM), float(self.across.max() + MARGIN_MM)
 
     @property
     def up_limits(self) -> tuple[float, float]:
-        """Return the lower and upper end of the picture, mm."""
+        """Return the lower and upper end, mm."""
         return float(self.up.min() - MARGIN_MM), float(self.up.max() + MARGIN_MM)
 
     def draw_insert(self, axes: Axes) -> None:
@@ -134,7 +132,7 @@ class TopView:
 
 
 def top_view(results: "Results") -> TopView | None:
-    """Return the view of the run's insert; None without maps."""
+    """Return the view of a run's insert; None without maps."""
     if results.maps is None or len(results.maps.triangles) == 0:
         return None
     side = str(results.summary.get("side", "right"))
@@ -142,9 +140,8 @@ def top_view(results: "Results") -> TopView | None:
 
 
 def mapped_frames(results: "Results", axis: HorizontalAxis, count: int = 8) -> list[int]:
-    """Return at most `count` frames that have a pressure map, spread over the motion.
-
-    The frame of the largest pressure is one of them.
+    """Return at most `count` frames with a map, spread over the motion, with that of the largest
+    pressure.
     """
     frames = np.array(sorted(map_rows(results)), int)
     if not len(frames):
@@ -167,7 +164,7 @@ def frame_of_peak(results: "Results") -> int | None:
 def draw_maps(
     results: "Results", view: TopView, axis: HorizontalAxis, frames: Sequence[int]
 ) -> Figure:
-    """Return a figure of pressure maps of some frames, on a scale from 0 to the run's largest."""
+    """Return pressure maps of some frames, on a scale to the run's largest."""
     largest = 0.0 if results.maps is None else float(np.nanmax(results.maps.peaks_Pa)) / MEGAPASCAL
     scale = Normalize(0.0, largest if largest > 0 else 1.0)
     across = min(4, len(frames))
@@ -196,7 +193,7 @@ def draw_map(
     frame: int,
     scale: Normalize,
 ) -> None:
-    """Draw the pressure map and the centres of pressure of a frame on the insert."""
+    """Draw a frame's pressure map and centres of pressure."""
     assert results.maps is not None
     row = map_rows(results)[frame]
     view.draw_insert(axes)
@@ -209,10 +206,9 @@ def draw_map(
 def place_maps(figure: Figure, down: int, across: int, gap: float) -> tuple[list[Axes], Axes]:
     """Return the axes of maps, row by row, and the axes of their colour bar to the right.
 
-    No layout engine is needed, because the sizes of the labels are known.
+    The labels' sizes are known, so no layout engine is needed.
 
     Args:
-        figure: empty figure.
         gap: distance between maps and colour bar, points.
     """
     figure.set_layout_engine("none")
@@ -235,7 +231,7 @@ def place_maps(figure: Figure, down: int, across: int, gap: float) -> tuple[list
 
 
 def pressure_bar(figure: Figure, scale: Normalize, **place: Any) -> Colorbar:
-    """Return the colour bar of pressure maps with a common scale, MPa."""
+    """Return the colour bar of maps with a common scale, MPa."""
     bar = figure.colorbar(ScalarMappable(scale, PRESSURE_MAP), **place)
     bar.set_label("contact pressure (MPa)")
     return bar
@@ -268,7 +264,7 @@ def _edge_length_mm(points: Array, triangles: NDArray[np.int64]) -> float:
 
 
 def _shade(points: Array, triangles: NDArray[np.int64]) -> Array:
-    """Return a grey level (n,) per point, for light that falls obliquely from above."""
+    """Return a grey level (n,), for light obliquely from above."""
     a, b, c = (points[triangles[:, k]] for k in range(3))
     normal = np.cross(b - a, c - a)
     normal *= np.where(normal[:, 1:2] < 0, -1.0, 1.0)
@@ -287,8 +283,6 @@ def draw_pressure(
     """Draw the pressure of one frame over the insert.
 
     Args:
-        axes: axes that show the insert.
-        view: top view of the insert.
         pressure: pressure at the map points, shape (n,), in the scale's unit.
         scale: colour scale that begins at 0.
         gap: gap at the map points, m, shape (n,). It locates the edge of the contact between the
@@ -338,7 +332,7 @@ def _caption(results: "Results", axis: HorizontalAxis, frame: int) -> str:
 def _label_stops(
     axes: Axes, x: Array, y: Array, axis: HorizontalAxis, frames: Sequence[int], colour: str
 ) -> None:
-    """Draw dots at both ends and at `frames` of a path, labelled with the position on the axis."""
+    """Draw dots at ends and `frames` of a path, labelled with the position on the axis."""
     finite = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if not len(finite):
         return
@@ -364,7 +358,7 @@ def _label_stops(
 
 
 def _spread(heights: Array, step: float) -> Array:
-    """Return increasing heights, moved apart so that neighbours differ by at least `step`."""
+    """Return increasing heights at least `step` apart."""
     count = np.arange(len(heights))
     raised = np.maximum.accumulate(heights - step * count) + step * count
     return raised - 0.5 * float(np.mean(raised - heights))
@@ -375,9 +369,8 @@ COUNT = 8
 
 
 def draw_button_maps(results: "Results", axis: HorizontalAxis) -> Figure | None:
-    """Return a figure of the button's pressure maps in some frames; None without maps.
-
-    The frame of the largest pressure is one of them.
+    """Return the button's maps in some frames, with that of the largest pressure; None without
+    maps.
     """
     maps, rows = results.button_maps, map_rows(results, results.button_maps)
     if maps is None or not rows or not len(maps.triangles):

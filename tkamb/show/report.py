@@ -56,7 +56,7 @@ POLICY = (
     "default-src 'none'; script-src {script}; style-src-elem {style}; "
     "style-src-attr 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
 )
-"""Security policy: the browser runs only the page's script and loads nothing from elsewhere."""
+"""Security policy: only the page's script runs, and nothing is loaded from elsewhere."""
 THIRD = 2 / 3 * WIDTH
 """Inches: width of a plot in a row of three."""
 SCRIPTS = ("cursor.js", "units.js", "insert.js", "downloads.js", "start.js")
@@ -79,11 +79,7 @@ def write_report(results: "Results", path: str | Path) -> None:
 
 
 def report_html(results: "Results", progress: Progress = lambda drawn: drawn) -> str:
-    """Return the report as a self-contained HTML page.
-
-    Args:
-        progress: function that wraps the plots, for example a progress bar.
-    """
+    """Return the report as a self-contained HTML page."""
     axis, shown = horizontal_axis(results), shown_frames(results)
     drawn = results_at(results, shown)
     drawn_axis = horizontal_axis(drawn)
@@ -272,9 +268,8 @@ def _cursor_data(results: "Results", axis: HorizontalAxis) -> dict[str, Any]:
 
 
 def _cursor_lines(panel: Panel) -> list[dict[str, Any]]:
-    """Return the curves of a panel, with the number of decimals to show.
-
-    The decimals resolve about a hundredth to a thousandth of the panel's largest value.
+    """Return a panel's curves, with decimals that resolve about a hundredth to a thousandth of its
+    largest value.
     """
     largest = max(float(np.nanmax(np.abs(line.values))) for line in panel.lines)
     digits = int(np.clip(2 - np.floor(np.log10(largest)), 0, 4)) if largest > 0 else 0

@@ -42,7 +42,6 @@ class Entry:
     """One part of the scene.
 
     Args:
-        part: name of the part, mostly the name of its table.
         file: file of the part; None: the scene file.
     """
 
@@ -111,7 +110,7 @@ def _motion(case: Case) -> Entry:
 
 
 def _in_words(case: Case) -> str:
-    """Return AP and axial rotation from least to most flexion in words, to check their signs."""
+    """Return AP and axial rotation over flexion in words, to check their signs."""
     motion = case.motion
     if {"ap", "axial_rotation"} & set(motion.unrecorded):
         return ""
@@ -190,7 +189,7 @@ def _ligaments(recording: Recording) -> Entry:
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Return names separated by commas. MCL1, MCL2, MCL3 are abbreviated as MCL1–3."""
+    """MCL1, MCL2, MCL3 are abbreviated as MCL1–3."""
     text: list[str] = []
     for stem, group in groupby(names, lambda name: name.rstrip("0123456789")):
         members = list(group)
@@ -250,7 +249,6 @@ class SceneCheck:
     """Content of a scene, parts that are not modelled, and questions.
 
     Args:
-        entries: content of each file and table.
         missing: messages on packages that a run needs and that are not installed.
     """
 
@@ -305,7 +303,7 @@ def check_scene(
 ) -> SceneCheck:
     """Read a scene with its files and check them for unlikely values, without a run.
 
-    Meshes are not checked for use by the contact model. Only a run does this.
+    Only a run checks that the contact model can use the meshes.
 
     Args:
         overrides: dotted scene key -> value, see `tkamb.load_scene`.

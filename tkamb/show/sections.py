@@ -1,7 +1,7 @@
 """Sections of the report in words, and its Methods paragraph.
 
-The paragraph states models, equations, numbers, parts that are not modelled, software and
-references. Its main source is `scene_tables` in summary.json. `assets/methods.txt` has the words.
+It states models, equations, numbers, parts that are not modelled, software and references, mainly
+by `scene_tables` in summary.json; `assets/methods.txt` has the words.
 """
 
 import base64
@@ -87,11 +87,9 @@ NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 
 @dataclass(frozen=True)
 class TextTable:
-    """A table of texts.
-
-    Args:
-        headings: heading of each column, a name or (name, unit).
-        rows: cells of each row. In a table of strains, the name of the bundle comes first.
+    """Args:
+    rows: cells below each heading, a name or (name, unit). In a table of strains, the bundle
+        comes first.
     """
 
     headings: Sequence[Any]
@@ -109,7 +107,7 @@ def motion_table(results: "Results", axis: HorizontalAxis) -> TextTable:
 
 
 def strain_table(summary: Mapping[str, Any]) -> TextTable | None:
-    """Return the table of the ligaments' strains, %. A high strain suggests a wrong insertion."""
+    """Return the ligaments' strains, %; a high one suggests a wrong insertion."""
     result = summary.get("ligament_strain")
     if not result:
         return None
@@ -133,7 +131,7 @@ def flag_rows(results: "Results", axis: HorizontalAxis) -> list[tuple[str, str, 
 def reasons(statuses: Sequence[str]) -> dict[str, list[int]]:
     """Return reason in plain words -> frames with this reason, failures first.
 
-    Reasons that differ only in a number become one reason with the range of the number.
+    Reasons that differ only in a number become one, with its range.
     """
     result: dict[str, list[tuple[int, str]]] = {}
     for frame, status in enumerate(statuses):
@@ -150,7 +148,7 @@ def reasons(statuses: Sequence[str]) -> dict[str, list[int]]:
 
 
 def _with_ranges(variants: Sequence[str]) -> str:
-    """Return one text with ranges for texts that differ only in their numbers."""
+    """Return one text with ranges for texts of other numbers."""
     columns = zip(*(NUMBER.findall(words) for words in variants), strict=True)
     ranges = []
     for numbers in columns:
@@ -253,7 +251,7 @@ OTHER_WEAR = (
 def wear_section(results: "Results") -> dict[str, Any] | None:
     """Return the content of the section on wear; None: the folder has no wear.json.
 
-    If wear.json belongs to another scene or other frames, the section states only this.
+    For a wear.json of another scene or other frames it states only this.
     """
     result, folder = wear_of_run(results), results.directory
     if result is None or folder is None:
@@ -299,9 +297,8 @@ def _wear_content(wear: dict[str, Any], picture: str) -> dict[str, Any]:
 def wear_of_run(results: "Results") -> dict[str, Any] | None:
     """Return the content of wear.json in a run's folder; None: the folder has no such file.
 
-    The result is empty if wear.json belongs to the button, another scene, other files or other
-    frames. If the wear was computed from the whole motion or from a simulator's cycle, the frames
-    of the run are not compared.
+    It is empty if wear.json belongs to the button, another scene, other files or other frames;
+    these are not compared if the wear is of the whole motion or a simulator's cycle.
     """
     folder = results.directory
     if folder is None or not (folder / WEAR_NAME).is_file():
@@ -336,7 +333,7 @@ def _wear_legend(wear: dict[str, Any], bands: dict[str, Any]) -> str:
 
 
 def _wear_range(wear: dict[str, Any], key: str) -> str:
-    """Return in words the range of a number over the range of the wear factor."""
+    """Return the range of a number over that of the wear factor, in words."""
     limits = wear.get(f"{key}_range")
     return "–" if limits is None else f"{_significant(limits[0])} to {_significant(limits[1])}"
 
@@ -492,7 +489,7 @@ def _weights(markers: Mapping[str, Any]) -> str:
 
 
 def _laws(tables: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
-    """Return name -> words and source of the ligaments' laws. Generic bundles are "two-line"."""
+    """Return name -> words and source of ligament laws; generic bundles are "two-line"."""
     names = {one["law"] for one in tables.get("ligament") or ()} | {"two-line"}
     laws = {name: LIGAMENT_LAWS.find(name) for name in LIGAMENT_LAWS.names() if name in names}
     return {name: (law.words, law.source) for name, law in laws.items()}

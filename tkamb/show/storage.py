@@ -58,9 +58,9 @@ def write_storage(path: Path, columns: Mapping[str, Array], in_degrees: bool) ->
 def write_results_storage(results: "Results", path: Path) -> str:
     """Write the numbers of a run as a storage file.
 
-    Columns keep their names, units (`_N`, `_mm`, `_deg`) and order; `time_s` is called `time`.
-    A missing number is `nan`. The column `status` has numbers instead of words: 0 is "ok", 1 a
-    frame to be read with care, 2 a failed frame.
+    Columns keep their names, units (`_N`, `_mm`, `_deg`) and order, but `time_s` is called `time`,
+    and a missing number is `nan`. `status` is 0 for "ok", 1 for a frame to be read with care, 2 for
+    a failed frame.
 
     Returns:
         A line of text with the numbers of frames and columns.
@@ -88,9 +88,7 @@ def write_trc(path: Path, time: Array, markers: Mapping[str, Array], rate_Hz: fl
     """Write markers as a `.trc` file in millimetres. A missing position has empty cells.
 
     Args:
-        time: (n,) s, times of the rows.
         markers: label -> (n, 3) positions, m; NaN where missing.
-        rate_Hz: sampling rate of the recording, Hz.
 
     Raises:
         InputError: the file cannot be written.
@@ -117,14 +115,14 @@ def write_trc(path: Path, time: Array, markers: Mapping[str, Array], rate_Hz: fl
 
 
 PRINT_DPI = 300
-"""Dots per inch of a PNG: what journals ask for in figures of lines and grey levels."""
+"""Dots per inch of a PNG, as journals ask for lines and grey levels."""
 FORMATS = ("svg", "pdf", "png")
 
 
 def write_figures(results: "Results", folder: Path) -> list[str]:
-    """Write every plot and map of a run in each of `FORMATS` and return the names without suffix.
+    """Write every plot and map in each of `FORMATS`; return the names without suffix.
 
-    Each file holds the title, the unit, the licence of the results and the version of tkamb.
+    Each file holds title, unit, the licence of the results and tkamb's version.
     """
     names = []
     for name, words, figure in _figures(results, horizontal_axis(results)):

@@ -25,7 +25,7 @@ from tkamb.studies.cohort.plan import Cohort, CohortRun
 from tkamb.studies.verdict import KINDS, MAX_ERROR, Verdict
 
 WEAR = "volume_mm3_per_Mc"
-"""Key of the worn volume in `Group.wear`. With _low or _high: an end of the wear factor's range."""
+"""Key of the worn volume; with _low or _high an end of the wear factor's range."""
 BANDS = (
     "Dot: mean over the runs. Thick bar: smallest to largest run. Thin bar: these ends extended by "
     "the known error of the contact model (pressure), or by the range of the wear factor (wear), "
@@ -44,8 +44,6 @@ class Bar:
 
     Args:
         series: label in the legend; "": no label.
-        low: smallest value of the runs.
-        high: largest value of the runs.
         most: upper end of the uncertainty.
     """
 
@@ -69,7 +67,7 @@ def run_error(run: CohortRun, outcome: Outcome) -> KnownError | str | None:
 
 
 def factor_names(cohort: Cohort) -> list[str]:
-    """Return the names of the designs' factors. The first is the one on the horizontal axis."""
+    """Return the names of the designs' factors, that on the horizontal axis first."""
     return list(dict.fromkeys(name for design in cohort.table.design for name in design.factors))
 
 
@@ -108,8 +106,7 @@ def _bar(cohort: Cohort, group: Group, values: Array, least: Array, most: Array)
 def _labels(cohort: Cohort, group: Group) -> tuple[str, str]:
     """Return place and series of a group's bar.
 
-    The place is the first factor of the design, the series its other factors. Without factors
-    the place is the name of the group.
+    They are the design's first factor and its others; without any the group's name.
     """
     names = factor_names(cohort)
     designs = {one.name: one for one in cohort.table.design}
@@ -200,7 +197,7 @@ def _distance(verdict: Verdict) -> float:
 
 
 def _group(verdict: Verdict) -> str:
-    """Return the label of a case: its extreme parameters, its model, or the kind of its run."""
+    """Return a case's extreme parameters, its model, or the kind of its run."""
     if verdict.contact == "run":
         return " ".join(verdict.case.split()[:2])
     if verdict.contact != "lattice":

@@ -88,7 +88,7 @@ SETTINGS: Any = {
 
 
 def new_figure(width: float, height: float) -> "Figure":
-    """Return an empty figure, size in inches. It needs no display."""
+    """Return an empty figure, size in inches, which needs no display."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
@@ -104,12 +104,10 @@ def settings() -> Any:
 def svg_text(figure: "Figure", name: str, dpi: int = 150) -> str:
     """Return the figure as inline SVG that scales with the page.
 
-    The SVG has no style element, because the page has the style of lines. All ids have the prefix
-    `name`, so that they are unique in the page. The page's scripts draw over the first axes with
-    these attributes of the SVG:
-      `data-box`: left, right, top and bottom of the axes, points.
-      `data-range`: values at the left and right end of the axes.
-      `data-heights`: values at the lower and upper end of the axes.
+    It has no style element, because the page has the style of lines, and unique ids with the prefix
+    `name`. For the page's scripts the first axes have `data-box`: left, right, top and bottom,
+    points. `data-range`: values at their left and right end. `data-heights`: values at their lower
+    and upper end.
     """
 
     with settings():
@@ -164,7 +162,7 @@ TICK_LABEL_POINTS = 9.0
 
 
 def set_place(axes: Axes, x: float, bottom: float, wide: float, tall: float) -> None:
-    """Set the position of axes in their figure, points; switch off the figure's layout engine."""
+    """Set the position of axes, points; switch off the figure's layout engine."""
     figure = axes.get_figure(root=True)
     assert figure is not None
     figure.set_layout_engine("none")
@@ -173,7 +171,7 @@ def set_place(axes: Axes, x: float, bottom: float, wide: float, tall: float) -> 
 
 
 def leave_unmeasured(axis: Axis) -> None:
-    """Make the layout engine ignore the tick labels of an axis, which saves their measurement."""
+    """Make the layout engine ignore an axis' tick labels, which saves time."""
     for tick in axis.get_major_ticks(len(axis.get_majorticklocs())):
         tick.label1.set_in_layout(False)
         tick.label2.set_in_layout(False)
@@ -198,11 +196,7 @@ def label_width(axis: Axis) -> float:
 
 
 def overhang(axis: Axis, length: float) -> tuple[float, float]:
-    """Return how far tick labels of a horizontal axis extend past its left and right end, points.
-
-    Args:
-        length: length of the axis, points.
-    """
+    """Return how far tick labels extend past both ends of an axis of a `length`, points."""
     labels = shown_labels(axis)
     margin = max((0.5 * width - place * length for place, width in labels), default=0.0)
     right = max((0.5 * width - (1.0 - place) * length for place, width in labels), default=0.0)
@@ -212,8 +206,8 @@ def overhang(axis: Axis, length: float) -> tuple[float, float]:
 class Renderer(RendererSVG):
     """SVG renderer that measures each text once for all figures.
 
-    A picture with `interpolation="none"` is stored once in a figure, in its own resolution. The
-    browser smooths it. It is not clipped.
+    A picture with `interpolation="none"` is stored once, unclipped, in its own resolution; the
+    browser smooths it.
     """
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
@@ -228,7 +222,7 @@ class Renderer(RendererSVG):
         im: Any,
         transform: Affine2DBase | None = None,
     ) -> None:
-        """Draw a picture (rows, columns, 4). With a transform, its resolution is preserved."""
+        """Draw a picture (rows, columns, 4), in its own resolution with a transform."""
         if transform is None:
             return super().draw_image(gc, x, y, im)
         content, (rows, columns) = im.tobytes(), im.shape[:2]
@@ -245,7 +239,7 @@ class Renderer(RendererSVG):
         self.writer.element("use", href=f"#{name}", transform=f"matrix({matrix})")
 
     def _get_font_height_metrics(self, prop: FontProperties) -> tuple[float, float, float]:
-        """Return ascent, descent and line gap, points. Matplotlib 3.11 and later call this."""
+        """Return ascent, descent and line gap, points, for Matplotlib 3.11 and later."""
         return _letter_heights(prop.copy())
 
     def get_text_width_height_descent(
@@ -279,10 +273,8 @@ def png_address(picture: NDArray[np.uint8]) -> str:
 
 
 def text_width(text: str, size: float) -> float:
-    """Return the width of a line of text, points. Call it within `style.settings`.
-
-    Args:
-        size: size of the letters, points.
+    """Return the width of a line of text, points. Call it within `style.settings`; the size is in
+    points.
     """
     return _text_size(text, FontProperties(size=size), False)[0]
 

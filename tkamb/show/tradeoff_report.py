@@ -40,7 +40,7 @@ NAMES = dict(zip(KEYS, (key.replace("_", " ") for key in KEYS), strict=True)) | 
     "map": "the pressure map (L2)",
 }
 COMPARED_ON, COMPARED_AT_MM = "two condyles", 2.0
-"""Case and cell size, mm, for the comparison of the default lattice with finite elements."""
+"""Case and cell size, mm, at which the default lattice is compared with finite elements."""
 DEFAULT = "lattice"
 
 Setting = tuple[str, float]
@@ -171,7 +171,7 @@ def setting_of(row: Row) -> Setting:
 
 
 def bodies_of(case: str) -> str:
-    """Return the name of the bodies of a case. All poses of the same bodies share it."""
+    """Return the name of a case's bodies, which all their poses share."""
     if case.endswith(" deg"):
         return case.split()[0]
     return {"varus": "two condyles"}.get(case, case)
@@ -180,8 +180,8 @@ def bodies_of(case: str) -> str:
 def recommendations(rows: Sequence[Row]) -> list[str]:
     """Return a sentence for each limit: the fastest setting that is within it in all cases.
 
-    Only settings with results on all pairs of bodies are compared. Their time is the median over
-    the pairs of the time of a warm press.
+    Only settings with results on all pairs of bodies are compared, by the median over the pairs of
+    a warm press's time.
     """
     if len({bodies_of(row.job.case) for row in rows}) < MIN_BODIES:
         return ["no recommendation from so few cases: run the whole study, without --quick"]
@@ -282,7 +282,7 @@ def _against(row: Row, lattice: Row) -> str:
 
 
 def _difference(lattice: Row, peer: Row) -> str:
-    """Return the differences of the lattice from another model in words, % of that model."""
+    """Return the differences from another model in words, % of it."""
     a, b = lattice.measure.values, peer.measure.values
     if not a or not b:
         return "values not kept"

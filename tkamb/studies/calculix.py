@@ -1,12 +1,12 @@
 """CalculiX as an independent check of the lattice, on the same hexahedra, pose and load.
 
-CalculiX runs as a process with one thread and a time limit. It uses no result of the lattice. At
+CalculiX runs as a process with one thread and a time limit, and uses no result of the lattice. At
 the initial position of the femoral component an elastic foundation carries the load. CalculiX has
 no warm start, so its cold and warm times are equal.
 
-The contact nodes lie on the smooth surface of the insert's mesh, as in the lattice. The femoral
-component is faceted. CalculiX gives pressures on the deformed faces. They are converted to nodal
-forces and divided by the undeformed tributary areas, as in the built-in models.
+The contact nodes lie on the smooth surface of the insert's mesh, as in the lattice; the femoral
+component is faceted. Its pressures on deformed faces are converted to nodal forces and divided by
+the undeformed tributary areas, as in the built-in models.
 
 Linear cases use small strain in both programs. With the Ramberg-Osgood law CalculiX uses finite
 strain (true stress as a function of Eulerian strain) and the built-in models use small strain.
@@ -57,7 +57,6 @@ class PeerRun:
 
     Args:
         blocks: name of the output -> its last table of numbers in the .dat file.
-        seconds: time of the process, s.
         peak_rss_MB: peak memory of the process, MB (1e6 bytes).
         iterations: number of equilibrium iterations, with one factorisation each.
     """
@@ -78,9 +77,6 @@ def find_program() -> str:
 
 def run_calculix(text: str, longest: float = LONGEST_SECONDS) -> PeerRun:
     """Run CalculiX on an input deck.
-
-    Args:
-        longest: time limit, s.
 
     Raises:
         InputError: CalculiX is not installed.
@@ -133,12 +129,12 @@ def _error_line(path: Path) -> str:
 
 
 def _iterations(text: str) -> int:
-    """Count the iterations in a .cvg file: each is a line that begins with a step number."""
+    """Count the lines of a .cvg file that begin with a step number."""
     return sum(line.split()[:1] != [] and line.split()[0].isdigit() for line in text.splitlines())
 
 
 def _blocks(lines: Iterable[str]) -> dict[str, Array]:
-    """Return the tables of a .dat file, keyed by the set in the title, else by its first word."""
+    """Return the tables of a .dat file by the set in the title, or its first word."""
     blocks: dict[str, list[list[float]]] = {}
     rows: list[list[float]] = []
     for line in lines:
@@ -166,7 +162,6 @@ class PeerAnswer:
     Args:
         result: contact result on the contact nodes of the lattice's grid.
         prepare_seconds: time to make the grid, the initial guess and the deck, s.
-        nodes: number of nodes of the insert.
         balance: sum of the vertical contact forces, divided by the load.
     """
 
@@ -180,12 +175,7 @@ class PeerAnswer:
 def measure_by_calculix(
     case: StudyCase, grid_mm: float, longest: float = LONGEST_SECONDS
 ) -> Measure:
-    """Return cost and results of CalculiX on a case; after an error only the status.
-
-    Args:
-        grid_mm: edge length of the hexahedra, mm.
-        longest: time limit, s.
-    """
+    """Return cost and results of CalculiX on a case; after an error only the status."""
     try:
         answer = press_by_calculix(case.pair, case.load, case.pose, grid_mm, longest=longest)
     except ComputationError as error:
@@ -219,7 +209,6 @@ def press_by_calculix(
         pose: pose_femoral_in_insert, shape (4, 4); its y has no effect.
         grid_mm: edge length of the hexahedra, mm.
         element: element type, "C3D8I" or "C3D8".
-        longest: time limit, s.
 
     Raises:
         InputError: CalculiX is not installed, or the deck cannot express the material or bearing.
@@ -275,13 +264,13 @@ def _deformed_map(problem: PressProblem, run: PeerRun) -> ContactMap:
 
 
 def _gaps(problem: PressProblem, pose: Array, deformed: ContactMap) -> Array:
-    """Return the vertical gaps (c,) above the deformed nodes, m; inf where no facet is above."""
+    """Return (c,) above the deformed nodes, m; inf where no facet is above."""
     above, _ = problem.floor.over(deformed.points, pose)
     return np.nan_to_num(above[:, 1] - deformed.points[:, 1], nan=np.inf)
 
 
 def _nodal_forces(problem: PressProblem, pose: Array, run: PeerRun, deformed: ContactMap) -> Array:
-    """Return the forces (c, 3) on the contact nodes, N: pressure times deformed tributary area."""
+    """Return (c, 3), N: pressure times deformed tributary area."""
     stress = run.blocks["contact"]
     pressure = np.zeros(len(deformed.points))
     place = np.searchsorted(problem.nodes, stress[:, 0].astype(np.int64) - 1)

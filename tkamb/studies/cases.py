@@ -1,8 +1,7 @@
 """Cases of the studies: contacts of spheres and dishes, the shipped knee, and extremes.
 
-Some cases have bodies of simple shape (spheres, dishes, flat blocks). Others are the shipped knee
-at stored poses, or the knee of a user's scene. The last functions of the module change the
-recordings of the shipped knee bend.
+Bodies have a simple shape (spheres, dishes, flat blocks), or are the shipped knee at stored poses,
+or the knee of a user's scene.
 """
 
 import csv
@@ -61,7 +60,6 @@ def block(
 
     Args:
         height: height of the upper surface, m, as a function of the arrays x and z, m.
-        size: lengths along x and z, m.
         spacing: distance between the vertices of the upper surface, m.
     """
     x, z = (np.linspace(-s / 2, s / 2, max(3, round(s / spacing) + 1)) for s in size)
@@ -136,7 +134,7 @@ KNEE_CASES = Path(__file__).with_name("knee_cases.json")
 RECORDINGS = ("motion.csv", "tibia.csv", "ground_reaction.csv")
 """Recorded tables of the shipped knee bend."""
 FLEXIONS_DEG = (15.0, 60.0, 105.0)
-"""deg: flexions of the cases of a knee. A user's scene gives the frames nearest to them."""
+"""deg: flexions of the cases of a knee. A user's scene gives the nearest frames."""
 
 
 @dataclass(frozen=True)
@@ -186,8 +184,7 @@ class StudyCase:
 def content_hash(pair: ContactPair, arrays: Sequence[Array], words: tuple[Any, ...]) -> str:
     """Return the SHA-256 of two bodies, further arrays, and the repr of further values.
 
-    Numbers are rounded to 1e-12 and zeros lose their sign, so that round-off does not change the
-    hash.
+    Numbers are rounded to 1e-12 and zeros lose their sign, so that round-off has no effect.
     """
     digest = hashlib.sha256()
     meshes = [a for body in (pair.femoral, pair.insert) for a in (body.vertices, body.faces)]
@@ -208,7 +205,7 @@ def case_names(scene: Path | None = None) -> tuple[str, ...]:
 
 
 def study_case(name: str, scene: Path | None = None) -> StudyCase:
-    """Return the case with a given name; `scene` is a user's scene file."""
+    """Return the case of a name; `scene` is a user's scene file."""
     if name in _ANALYTIC:
         return _ANALYTIC[name](name)
     if name not in case_names(scene):
@@ -226,7 +223,7 @@ def _sphere(name: str) -> StudyCase:
 
 
 def _two_condyles(name: str) -> StudyCase:
-    """Return a case of two condyles of radius 22 mm, 22 mm apart, on a nonlinear insert of 8 mm."""
+    """Return two condyles of radius 22 mm, 22 mm apart, on a nonlinear insert of 8 mm."""
     label, dish_radius, varus_deg = BICONDYLAR[name]
     insert = block(dishes(8e-3, dish_radius, 11e-3), (30e-3, 46e-3))
     pair = ContactPair(balls(22e-3, 11e-3), insert, material("polyethylene"))
@@ -277,7 +274,7 @@ def _of_scene(name: str, path: Path, flexion: float) -> StudyCase:
 
 
 def copied_scene(folder: Path) -> Path:
-    """Copy the shipped knee bend into a folder and return the path of the copied scene file."""
+    """Copy the shipped knee bend into a folder and return its scene file."""
     shutil.copytree(SHIPPED_SCENE.parent, folder, dirs_exist_ok=True)
     return folder / SHIPPED_SCENE.name
 
@@ -320,19 +317,15 @@ divided into four. slivers: one vertex of each femoral ring is moved almost onto
 
 @dataclass(frozen=True)
 class Extreme:
-    """A contact problem in numbers. Lengths are in mm, angles in deg.
+    """A contact problem in numbers: mm and deg.
 
     Args:
         load_N: force along -y, N.
         thickness_mm: thickness of the insert under the lowest points of the dishes.
         aspect: length of the insert along x, relative to the base case.
-        nu: Poisson's ratio of the insert.
-        modulus_MPa: Young's modulus of the insert, MPa.
         linear: whether Hooke's law replaces Ramberg-Osgood.
         conformity: radius of the condyles over the radius of the dishes; 0: a flat insert.
         apart_mm: half the distance between the condyles; 0: a single condyle.
-        bearing: "fixed" or "mobile".
-        shape: shape of the bodies, see `Shape`.
     """
 
     load_N: float = 1500.0
@@ -507,7 +500,7 @@ BESIDE_CALCULIX: tuple[dict[str, object], ...] = (
     {"linear": True, "thickness_mm": 4.0},
     {"linear": True, "modulus_MPa": 2000.0},
 )
-"""Extremes with stored results of CalculiX. `lattice` and `fe` solve them on cells of 3 mm."""
+"""Extremes with stored results of CalculiX, which `lattice` and `fe` solve on cells of 3 mm."""
 
 
 def extremes() -> Iterator[Extreme]:

@@ -1,8 +1,8 @@
-"""Stored rows of a study, which make it possible to stop and resume the study.
+"""Stored rows of a study, which can therefore be stopped and resumed.
 
-Each row is stored as soon as it is measured, as a line of JSON: {"key": ..., "row": ...,
-"sha256": ...}. "key" is the SHA-256 of the measured case and the code. "sha256" is the SHA-256 of
-key and row. An incomplete or changed line counts as absent.
+Each row is stored at once as a line of JSON, {"key": ..., "row": ..., "sha256": ...}: "key" is the
+SHA-256 of the measured case and the code, "sha256" that of key and row. An incomplete or changed
+line counts as absent.
 """
 
 import hashlib
@@ -27,8 +27,7 @@ class KeptRows:
     """The stored rows in the folder of a study.
 
     Args:
-        resume: whether to use the rows of an earlier study in the folder. Otherwise they are
-            deleted.
+        resume: whether to use an earlier study's rows in the folder, or delete them.
     """
 
     def __init__(self, directory: Path, resume: bool) -> None:
@@ -38,11 +37,11 @@ class KeptRows:
         write_text(self.path, "".join(_line(key, row) for key, row in self._rows.items()))
 
     def get(self, key: str) -> Row | None:
-        """Return the row with a key; None if there is no such row."""
+        """Return the row with a key, or None."""
         return self._rows.get(key)
 
     def read(self, key: str, kind: type[T]) -> T | None:
-        """Return the row with a key as an object; None if there is no such row."""
+        """Return the row with a key as an object, or None."""
         if key not in self._rows:
             return None
         with undamaged(self.path, "remove the file, or leave out resume=True"):

@@ -1,8 +1,7 @@
 """Times, memory and results of one contact model on one case.
 
-Each job runs in a separate process: `python -m tkamb.studies.measures` reads a `Job` as JSON from
-standard input and prints the `Measure` as JSON. The peak memory is therefore that of the job alone,
-and a crash or a hang is recorded. The process uses one thread for repeatable times.
+Each job runs in a process of its own with one thread for repeatable times, which reads a `Job` and
+prints the `Measure` as JSON: the peak memory is that of the job, and a crash or a hang is recorded.
 
 `quantities`, `errors` and `map_error` compare two contact results.
 """
@@ -75,11 +74,11 @@ def _relative(
 
 
 Raster = dict[tuple[int, int], float]
-"""Raster point (i along x, j along z) -> pressure, Pa. Points without pressure are omitted."""
+"""Raster point (i along x, j along z) -> pressure, Pa, without points of zero."""
 
 
 def raster_of(stored: Mapping[str, float]) -> Raster:
-    """Return the raster that is stored as "i j" -> pressure, Pa."""
+    """Return the raster stored as "i j" -> pressure, Pa."""
     return {(int(i), int(j)): p for (i, j), p in ((k.split(), p) for k, p in stored.items())}
 
 
@@ -134,7 +133,7 @@ ONE_THREAD = dict.fromkeys(
 
 @contextmanager
 def environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Set environment variables inside a `with` block. Processes started in it inherit them."""
+    """Set environment variables inside a `with` block, also for processes started in it."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
@@ -146,11 +145,8 @@ def environment(variables: Mapping[str, str]) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Job:
-    """A contact model and a case to measure.
-
-    Args:
-        resolution_mm: spacing of the model's map points, mm.
-        scene: path of a user's scene, for the cases of that scene.
+    """Args:
+    scene: path of a user's scene, for the cases of that scene.
     """
 
     case: str
@@ -175,7 +171,6 @@ class Measure:
         cold_seconds: median time of a first press without a warm start, s.
         warm_seconds: median time of a press at the next pose with a warm start, s.
         peak_rss_MB: peak memory of the process, MB.
-        iterations: number of iterations of the first press.
         values: quantities of the first press, see `quantities`.
         map: "i j" -> pressure, Pa, on a raster of 1 mm.
     """
@@ -241,9 +236,9 @@ def _model(job: Job) -> ContactModel:
 def _first(
     model: ContactModel, job: Job
 ) -> tuple[tuple[float, float], tuple[StudyCase, Any, ContactResult, WarmStart]]:
-    """Return the median times of preparation and first press, s, and the last results of both.
+    """Return the median times of preparation and first press, s, and their last results.
 
-    The bodies are made anew for each repeat, so that no cached property shortens the time.
+    The bodies are new for each repeat, so that no cached property shortens the time.
     """
     prepares: list[float] = []
     colds: list[float] = []

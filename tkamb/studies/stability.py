@@ -1,7 +1,7 @@
 """Stability study: extreme cases of contacts and of whole runs, each judged in its own process.
 
-The shipped knee bend is run on a few frames with one extreme parameter. The expected result is
-known without a second solver:
+The shipped knee bend is run on a few frames with one extreme parameter; the expected result needs
+no second solver:
 
 - all: the nodal forces on the insert sum to the superior-inferior force of the equilibrium.
 - time: if the motion takes `scale` times as long, the forces are F_static + F_inertia / scale².
@@ -167,7 +167,7 @@ def _relative_error(extreme: SceneExtreme, results: "Results", folder: Path) -> 
 
 
 def _add_noise(folder: Path, noise: float) -> None:
-    """Add noise to the knee's coordinates. `noise` is the standard deviation in mm and deg."""
+    """Add noise of a standard deviation in mm and deg to the knee's coordinates."""
 
     def with_noise(head: list[str], rows: Array) -> Array:
         rng = np.random.default_rng(160)
@@ -227,7 +227,7 @@ QUICK_SHAPES: tuple[Shape, ...] = ("swapped", "lip", "spike")
 
 
 def stability_cases(quick: bool) -> list[Case]:
-    """Return the cases of the full or the quick study."""
+    """Return the cases of the study."""
     if not quick:
         return [*closed_forms(False), *extremes(), *scene_extremes()]
     coarse = (replace(c, resolution_mm=max(c.resolution_mm, QUICK_GRID_MM)) for c in extremes())
@@ -254,8 +254,8 @@ def run_stability(
     """Judge all cases and yield their verdicts in the order of the cases.
 
     Args:
-        longest: processor time limit of a case, s. The verdict does not depend on other processes.
-        kept: stored verdicts of earlier studies. They are not computed again; new ones are added.
+        longest: processor time limit of a case, s, whatever other processes do.
+        kept: stored verdicts, which are not computed again; new ones are added.
     """
     judges, stored = _Judges(longest, kept), stored_verdicts()
     # Threads, and the processes that they start, leave Ctrl-C to this process, which stops them.
@@ -289,8 +289,8 @@ def _row_key(case: Case, longest: float) -> str:
 class _Judges:
     """Judges each case in a new process, because a case may crash or hang.
 
-    The processes are forked from a server process that has imported the modules, so a new process
-    costs milliseconds. Each process computes with one thread.
+    The processes, of one thread each, are forked from a server that has imported the modules, so
+    that a new one costs milliseconds.
     """
 
     def __init__(self, longest: float, rows: KeptRows | None) -> None:
@@ -369,7 +369,7 @@ def _ended(case: Case, kind: str, reason: str) -> Verdict:
 
 
 def judge_safely(case: Case, pressed: Callable[[], None] = lambda: None) -> Verdict:
-    """Return the verdict on a case; "exception" if it raises an unexpected exception."""
+    """Return the verdict; "exception" for an unexpected one."""
     try:
         if isinstance(case, Extreme):
             return judge(case, pressed)

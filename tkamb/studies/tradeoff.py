@@ -1,11 +1,10 @@
 """Trade-off of speed and accuracy: contact models on every case, and multibody settings.
 
-A `Row` contains the times and errors of one model on one case. The rows of a case that no other row
-beats are its Pareto front. By default, fine grids and solver options are measured only on some
-cases. With `full` every setting is measured on every case.
+A `Row` has the times and errors of one model on one case; the rows that no other row beats are the
+case's Pareto front. Fine grids and solver options are measured on some cases only, unless `full`.
 
-Each run changes one setting of the shipped knee bend. It is compared with the run as shipped at
-the same instants. A lower frame rate removes rows of the recordings (motion, shank and ground
+A multibody run changes one setting of the shipped knee bend and is compared with the run as shipped
+at the same instants. A lower frame rate removes rows of the recordings (motion, shank and ground
 reaction), so the derivatives come from the remaining rows.
 """
 
@@ -59,12 +58,10 @@ EQUAL_RATIO = 1.2
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """Cost and errors of one model on one case.
-
-    Args:
-        errors: name of `KEYS` -> error relative to the reference; empty if the job failed.
-        floor: largest relative uncertainty of the reference among `FRONT_ERRORS`.
-        on_front: whether the row is on the Pareto front of its case.
+    """Args:
+    errors: name of `KEYS` -> error relative to the reference; empty if the job failed.
+    floor: largest relative uncertainty of the reference among `FRONT_ERRORS`.
+    on_front: whether the row is on the Pareto front of its case.
     """
 
     job: Job
@@ -81,7 +78,7 @@ class Row:
         return max(self.floor, *(self.errors[key] for key in FRONT_ERRORS))
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the row as in `tkamb tradeoff --json`. Missing numbers are None."""
+        """Return the row as in `tkamb tradeoff --json`; missing numbers are None."""
         measure = self.measure
         row: dict[str, Any] = {
             "case": self.job.case,
@@ -124,7 +121,7 @@ def compared(job: Job, measure: Measure, reference: Reference) -> Row:
 
 
 def floor_of(reference: Reference) -> float:
-    """Return the largest relative uncertainty of a reference among `FRONT_ERRORS`."""
+    """Return the largest relative uncertainty among `FRONT_ERRORS`."""
     shifted = {k: v + reference.uncertainty[k] for k, v in reference.values.items()}
     uncertainty = errors(shifted, reference.values)
     return max(uncertainty[key] for key in FRONT_ERRORS)
@@ -150,7 +147,7 @@ def beats(first: tuple[float, float], second: tuple[float, float]) -> bool:
     """Return whether the first point (seconds, error) beats the second.
 
     It is faster and at least as accurate, or more accurate and not slower. Times within
-    `EQUAL_RATIO` count as equal.
+    `EQUAL_RATIO` are equal.
     """
     faster = first[0] * EQUAL_RATIO < second[0]
     not_slower = first[0] <= second[0] * EQUAL_RATIO
@@ -173,12 +170,11 @@ def read_rows(path: Path) -> list[Row]:
 QUICK_CASES = ("sphere", "two condyles")
 QUICK_MODELS = ("hertz", "foundation", "lattice", "lattice-linear", "fe")
 ONE_OF_EACH = ("sphere", "two condyles", "conforming", "knee 60 deg", "scene 60 deg")
-"""Cases on which the fine grids are measured. The other cases have the same bodies at another
-pose."""
+"""Cases on which the fine grids are measured; the others have the same bodies at another pose."""
 TRIED_ON = ("two condyles", "conforming", "knee 60 deg")
 """Cases on which the options of the models are varied."""
 PEER_GRIDS_MM: dict[str, tuple[float, ...]] = {"sphere": (2.0,), "two condyles": (2.0, 1.0)}
-"""Case -> cell sizes for CalculiX, mm. The two condyles take minutes at 1 mm."""
+"""Case -> cell sizes for CalculiX, mm; the two condyles take minutes at 1 mm."""
 
 
 @dataclass(frozen=True)
@@ -211,7 +207,7 @@ SETTINGS = {
     "lattice-source": Settings((2.0,), ()),
     "fe": Settings((2.0,), (1.5, 1.0), ({"newton": True},)),
 }
-"""Name of a built-in model -> its settings. Models of other packages use `Settings()`."""
+"""Built-in model -> its settings; models of other packages use `Settings()`."""
 
 
 def jobs(quick: bool = False, scene: Path | None = None, full: bool = False) -> list[Job]:
@@ -258,10 +254,9 @@ def _per_node(job: Job) -> float:
 def run_tradeoff(
     jobs: Sequence[Job], references: dict[str, Reference], rows: KeptRows | None = None
 ) -> Iterator[Row]:
-    """Measure the jobs and yield one row per job. The Pareto fronts are not yet marked.
+    """Measure the jobs; yield one row per job, without marks of the Pareto fronts.
 
     Args:
-        references: case name -> reference.
         rows: stored measures of earlier studies. They are not repeated; new ones are added.
     """
     for job in jobs:
@@ -291,8 +286,7 @@ def run_peer(
 
     Args:
         cases: contact problems. Those without an entry in `PEER_GRIDS_MM` are skipped.
-        references: case name -> reference.
-        rows: stored measures of earlier studies. They are not repeated; new ones are added.
+        rows: stored measures, as in `run_tradeoff`.
         sizes_mm: requested cell sizes, mm.
     """
     find_program()
@@ -312,14 +306,14 @@ def references_for(
     announce: Callable[[str], None],
     rows: KeptRows | None = None,
 ) -> dict[str, Reference]:
-    """Return case name -> reference. Those of a user's scene are computed and stored in `rows`.
+    """Return case name -> reference; those of a user's scene are stored in `rows`.
 
     Args:
         recompute: whether to compute and store the references again.
         announce: function that prints a line before a reference is computed.
 
     Raises:
-        InputError: a stored reference is missing, or belongs to an earlier version of its case.
+        InputError: a stored reference is missing, or is of an earlier version of its case.
         ComputationError: a reference cannot be computed.
     """
     stored = read_references(STORED)
@@ -366,7 +360,7 @@ class Change:
     """One change of the shipped scene.
 
     Args:
-        keys: dotted key of the scene -> value that replaces the shipped one.
+        keys: dotted key of the scene -> new value.
     """
 
     keys: dict[str, Any] = field(default_factory=dict)
@@ -422,11 +416,7 @@ class BodyRow:
 
 
 def run_body_trade(rows: KeptRows | None = None) -> Iterator[BodyRow]:
-    """Run the shipped knee bend with each change alone and yield one row per change.
-
-    Args:
-        rows: stored rows of earlier studies. They are not computed again; new rows are added.
-    """
+    """Run the shipped knee bend with each change alone that `rows` does not store."""
     base: _Run | None = None
     for name, change in CHANGES.items():
         key = row_key("body", name, asdict(change))

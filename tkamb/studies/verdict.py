@@ -7,9 +7,9 @@ Each extreme case is tested in three ways:
   forces agree with the pressure map.
 - A stored result of CalculiX on the same hexahedra (C3D8I), if there is one (`peer_distances`). The
   elements differ, so the bounds are the largest measured differences, rounded up.
-- Newton's method on the same grid, which shows errors of the solver without those of the grid.
+Newton's method on the same grid, which shows errors of the solver alone.
 
-A closed form is tested with its formula. Kinds of verdict:
+A closed form is tested with its formula. Accepted verdicts are stored. Kinds of verdict:
 
 - converged: the status is ok, all checks pass, and the result is within 2 % of the reference in
   approach, condyle force and peak pressure.
@@ -18,8 +18,6 @@ A closed form is tested with its formula. Kinds of verdict:
 - unverified: the status is ok, but the reference did not converge. Counts as failed.
 - exception: an exception of a class that tkamb does not define.
 - hang: the model exceeds its limit of processor time.
-
-Accepted verdicts are stored.
 """
 
 import json
@@ -67,10 +65,10 @@ def complaints(result: ContactResult, load: float, solved: bool, source_rule: bo
 
     Args:
         load: force along -y, N.
-        solved: whether the gaps are those of deformed nodes. Otherwise penetration and peak
-            pressure are not checked.
-        source_rule: whether pressure is the force along the insert's normal over a uniform area.
-            Otherwise it is the force over the tributary area of the node.
+        solved: whether the gaps are those of deformed nodes, so that penetration and peak pressure
+            are checked.
+        source_rule: whether pressure is the normal force over a uniform area; otherwise it is the
+            force over the node's tributary area.
     """
     force = np.linalg.norm(result.nodal_force, axis=1)
     along_y = -result.nodal_force[:, 1]
@@ -106,7 +104,7 @@ def _off(what: str, value: float, expected: float) -> str:
 
 
 def body_hash(extreme: Extreme) -> str:
-    """Return the SHA-256 of the bodies, material, pose, load and grid of an extreme case."""
+    """Return the SHA-256 of an extreme case: bodies, material, pose, load and grid."""
     words = (extreme.pair.material, extreme.pair.bearing, extreme.load_N, extreme.resolution_mm)
     return content_hash(extreme.pair, [extreme.pose], words)
 
@@ -119,7 +117,7 @@ def stored_answers(path: Path = PEER_ANSWERS) -> Mapping[str, tuple[str, Quantit
 
 
 def peer_distances(extreme: Extreme, result: ContactResult) -> dict[str, float]:
-    """Return the relative differences from CalculiX's stored result; empty if there is none."""
+    """Return the relative differences from CalculiX's stored result, if there is one."""
     if extreme.model not in PEER_MODELS or extreme.label not in stored_answers():
         return {}
     stored_hash, peer = stored_answers()[extreme.label]
@@ -140,7 +138,7 @@ MAX_ERROR = 0.02
 
 JUDGED = ("approach", "force", "peak_pressure")
 NEWTON_TOLERANCES = (1e-6, 1e-4, 1e-3)
-"""Tolerances of the reference in the order of trial. The first that converges is used."""
+"""Tolerances of the reference; the first that converges is used."""
 LOAD_STEPS = (0.1, 0.25, 0.4, 0.55, 0.7, 0.85, 1.0)
 """Load steps, as shares of the load, if Newton's method does not converge in one step."""
 KINDS = ("converged", "flagged", "unflagged_wrong", "unverified", "exception", "hang")
@@ -155,7 +153,6 @@ class Verdict:
         reason: reason of a verdict other than converged, or the flags of the result.
         error: largest relative difference from the reference; None without a comparison.
         seconds: time of preparation and press without the reference, s.
-        iterations: number of iterations of the model's solver.
         expected: kind of the stored verdict; None if there is none.
     """
 
@@ -262,7 +259,7 @@ def _differences_from_peer(extreme: Extreme, result: ContactResult) -> list[str]
 def compared(
     extreme: Extreme, result: ContactResult, reference: ContactResult, seconds: float
 ) -> Verdict:
-    """Return the verdict on a result with status ok, compared with its reference."""
+    """Return the verdict on a result with status ok."""
     differences = errors(quantities(result), quantities(reference))
     distance = max(differences[key] for key in JUDGED)
     correct = math.isfinite(distance) and distance <= MAX_ERROR
@@ -292,7 +289,7 @@ def _model(extreme: Extreme, **options: Any) -> ContactModel:
 
 
 def _reference(extreme: Extreme, state: Any, result: ContactResult) -> ContactResult:
-    """Return the result of another method: full Newton, or the generic search for the load."""
+    """Return the result by full Newton, or by the generic search for the load."""
     fields = getattr(contact_class(extreme.model), "__dataclass_fields__", {})
     if "newton" not in fields:
         searched = press_by_search(_model(extreme), state, extreme.load_N, extreme.pose)
@@ -315,7 +312,7 @@ def _by_steps(
     shares: tuple[float, ...],
     guess: Guess | None,
 ) -> ContactResult | None:
-    """Return Newton's result at the last share of the load; None if a step does not converge."""
+    """Return Newton's result at the last share of the load; None without convergence."""
     for share in shares:
         try:
             load = share * extreme.load_N

@@ -5,9 +5,9 @@ Find the normal forces lambda (and the approach D) such that, for every candidat
     gamma = gap + A lambda + D c >= 0,   lambda >= 0,   gamma lambda = 0
 
 Either D or the load -cᵀ lambda is given. A is the compliance along the femoral normals, symmetric
-and positive definite. c holds the y of these normals. Primal-dual active set (Hintermueller, Ito &
+and positive definite, c the y of these normals. Primal-dual active set (Hintermueller, Ito &
 Kunisch, SIAM J Optim 13:865, 2002, doi:10.1137/S1052623401383558). Once a set recurs, only the node
-with the largest violation changes. The search stops after twice as many sets as candidates.
+with the largest violation changes; the search stops after twice as many sets as candidates.
 """
 
 from dataclasses import dataclass
@@ -27,8 +27,6 @@ class ContactForces:
         gap: gamma, m, shape (n,), >= 0.
         approach: D, m.
         active: mask of the nodes in contact, shape (n,).
-        sets: number of active sets that were tried.
-        converged: whether the active set has stopped changing.
     """
 
     force: Array
@@ -52,7 +50,6 @@ def solve_contact(
     Args:
         compliance: A, m/N, shape (n, n).
         gap: gaps at zero force and approach, m, shape (n,).
-        normal_y: c, y of the femoral normals, shape (n,), negative.
         load: force along -y, N; None if the approach is given.
         active: initial guess of the nodes in contact, shape (n,).
         approach: m, used if the load is None.

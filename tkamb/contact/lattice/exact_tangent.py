@@ -15,7 +15,7 @@ displacement. With S = (1 - C lambda G)⁻¹ C, dlambda solves
 The active set is constant: where a node comes into contact, the derivative is one-sided. For a
 translation w, dH = m . w and dn = -G w; else dH and dn are central differences of the surface.
 
-`tkamb.contact.lattice.probe` has a faster approximation.
+The active set is constant: where a node comes into contact, the derivative is one-sided.
 """
 
 from dataclasses import dataclass
@@ -78,8 +78,7 @@ class SurfaceDerivatives:
     Args:
         slope: m, (n, 3).
         turn: G, 1/m, (n, 3, 3).
-        rise: dH by a displacement of the femur, (n, 6).
-        normal: dn by a displacement of the femur, (n, 3, 6).
+        rise: dH by a displacement of the femur, (n, 6), as dn, (n, 3, 6), in `normal`.
     """
 
     slope: Array
@@ -91,7 +90,7 @@ class SurfaceDerivatives:
 def _surface_derivatives(
     problem: ContactProblem, positions: Array, pose: Array
 ) -> SurfaceDerivatives:
-    """Return the derivatives of the femoral surface over positions (n, 3).
+    """Return the derivatives over positions (n, 3).
 
     Where the surface ends within the step, it is taken as its rigid tangent plane.
     """
@@ -129,7 +128,7 @@ def _central(ahead: tuple[Array, Array], behind: tuple[Array, Array]) -> tuple[A
 def _compliance(
     state: LatticeState, result: ContactResult, start: LatticeStart, nodes: Index
 ) -> Array:
-    """Return the compliance (3m, 3m), m/N, of the tangent stiffness, ordered by node."""
+    """Return the tangent stiffness' compliance (3m, 3m), m/N, by node."""
     problem = state.problem
     if problem.solid.material.is_linear:
         response = state.compliance.among(nodes)

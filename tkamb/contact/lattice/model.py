@@ -1,4 +1,4 @@
-"""Contact models on a lattice of cells, with the methods prepare, evaluate and press."""
+"""Contact models on a lattice of cells."""
 
 from abc import abstractmethod
 from dataclasses import dataclass, replace
@@ -50,21 +50,20 @@ from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.units import MILLIMETRE
 
 LEAST_OVERLAP = 1e-13
-"""m: smaller overlaps count as no contact. With 1e7 N/m their force is below 1e-6 N."""
+"""m: smaller overlaps count as no contact: with 1e7 N/m their force is below 1e-6 N."""
 COARSE = 1e-3
 """1: from this `tolerance` on the factor is stored in 16-bit integers.
 `LatticeSolverSettings.force_tolerance` states their rounding residual."""
 COVERED_APPROACH = 1.08
-"""1: the depth covered by the candidates must be at least this factor times the approach."""
+"""1: least ratio of the depth covered by the candidates and the approach."""
 
 
 @dataclass(frozen=True)
 class CellContact(ContactModel):
     """A solid of cells on the lattice's grid under a rigid femoral component.
 
-    The contact is frictionless, at small strain. Vertical rays measure the gaps between contact
-    nodes and femoral surface. Contact forces act along the femoral normal. The approach is an
-    unknown of the same iteration.
+    The contact is frictionless, at small strain. Vertical rays measure the gaps; contact forces act
+    along the femoral normal. The approach is an unknown of the same iteration.
 
     Args:
         resolution: edge of the cells, m.
@@ -133,7 +132,7 @@ class CellContact(ContactModel):
         held: Mask,
         nodes: Index,
     ) -> ElasticOperator:
-        """Return the operator, from disk if it is stored.
+        """Return the operator, stored or new.
 
         Raises:
             InputError: it does not fit into the available memory.
@@ -176,12 +175,9 @@ class CellContact(ContactModel):
         start: Guess | None = None,
         forces_only: bool = False,
     ) -> tuple[ContactResult, WarmStart]:
-        """Return the contact at a pose, and a warm start for the next; see `ContactModel`.
+        """Return the contact at a pose, and a warm start; see `ContactModel`.
 
         Args:
-            state: result of `prepare`.
-            pose: pose_femoral_in_insert, shape (4, 4).
-            start: an earlier result, or its warm start.
             forces_only: whether only the forces are needed. Then only the region of the warm start
                 is evaluated, a contact area is the sum of the tributary areas of the loaded nodes,
                 and nothing is flagged. This is accurate near the pose of the warm start
@@ -248,8 +244,7 @@ class CellContact(ContactModel):
     ) -> tuple[ContactResult, WarmStart]:
         """Solve with growing candidate sets until they cover the approach.
 
-        `gaps_and_planes` is the result of `undeformed` at the pose. `depth` is the expected
-        approach, m.
+        `gaps_and_planes` is `undeformed` at the pose, `depth` the expected approach, m.
         """
         (gaps, planes), settings = gaps_and_planes, self.settings
         before = lattice_start(state, guess_or_start)
@@ -293,9 +288,9 @@ class CellContact(ContactModel):
     ) -> Solution:
         """Solve with the stored factor, and by Newton's method if this does not converge.
 
-        Newton's method is not tried if the gap residual is at least the force residual: the nodes
-        then oscillate on the femoral surface, and would do so with Newton's method too. It is not
-        tried if the approach is larger than `covered`, m, because the caller then adds candidates.
+        It is not tried if the gap residual is at least the force residual (the nodes oscillate on
+        the femoral surface, also with Newton's method), or if the approach is larger than
+        `covered`, m: the caller then adds candidates.
         """
         if self.newton:
             return solve_by_newton(problem, pose, load, guess, settings)
@@ -316,11 +311,12 @@ class CellContact(ContactModel):
 
 @dataclass(frozen=True)
 class CalibratedLattice(CellContact):
-    """The calibrated lattice. It passes the patch test, for any Poisson's ratio.
+    """The calibrated lattice, which passes the patch test for any Poisson's ratio
+    (docs/lattice.md).
 
     A cell has 28 springs, which it shares with its neighbours, and a volume term. The material's
     curve gives one secant shear modulus per cell (J2 deformation theory, elastic bulk, small
-    strain). See docs/lattice.md.
+    strain).
     """
 
     name: ClassVar[str] = "lattice"
@@ -353,7 +349,7 @@ class LinearLattice(CellContact):
 class FiniteElements(CellContact):
     """B-bar hexahedra (mean dilatation), J2 deformation theory at eight Gauss points.
 
-    Grid, contact and pressure rules are those of the lattice. Small strain.
+    Grid, contact and pressure rules are those of the lattice, with small strain.
     """
 
     name: ClassVar[str] = "fe"
@@ -366,7 +362,7 @@ class FiniteElements(CellContact):
 
 
 def _with_start(result: ContactResult) -> tuple[ContactResult, WarmStart]:
-    """Return a result, and the warm start made from it without a lattice solution."""
+    """Return a result, and a warm start without a lattice solution."""
     return result, WarmStart.after(result)
 
 
@@ -377,12 +373,11 @@ def _start_after(
     depth: float,
     before: LatticeStart | None,
 ) -> LatticeStart:
-    """Return the warm start of a solution that has converged.
+    """Return the warm start of a converged solution.
 
     Args:
         contact: pose, pressure and gap of the solution.
         depth: travel of the femoral component since it touched the first contact node, m.
-        before: warm start of this solution.
     """
     if before is not None:
         before = replace(before, before=None)
@@ -396,7 +391,7 @@ def _start_after(
 
 
 def _warm_up(problem: ContactProblem, pair: ContactPair) -> None:
-    """Build everything that the first evaluation would build: ray trees and compiled loops."""
+    """Build what the first evaluation would: ray trees and compiled loops."""
     undeformed(problem, np.eye(4))
     pair.touch_at(np.eye(4))
     if not problem.solid.material.is_linear:

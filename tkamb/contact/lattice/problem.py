@@ -21,7 +21,7 @@ from tkamb.geometry.surface import Surface
 Direction = Literal["normal", "vertical"]
 
 LEAST_NORMAL_Y = -0.05
-"""1: femoral normals with a larger y carry no load. The limit is 87 deg from straight down."""
+"""1: femoral normals with a larger y (3 deg short of horizontal) carry no load."""
 UP = np.array([0.0, 1.0, 0.0])
 
 
@@ -65,7 +65,6 @@ class ContactProblem:
     """A solid, its linear operator, its contact nodes and the femoral component.
 
     Args:
-        operator: factor of the linear stiffness.
         index: lattice index of each node, (n, 3).
         held: mask of the unknowns held by the boundary, (3n,).
         direction: of the contact forces: along the femoral normal, or vertical (Sharma 2008).
@@ -113,7 +112,7 @@ class ContactProblem:
 class TangentPlanes:
     """The tangent planes of the femoral surface over contact nodes, at zero approach.
 
-    Points and outward unit normals (m, 3), m, lie on the verticals through the nodes.
+    Points and outward unit normals (m, 3), m, are on the verticals through the nodes.
     """
 
     points: Array
@@ -166,7 +165,7 @@ def tangent_planes(
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A subset of the elements (cells or springs) of a solid.
+    """A subset of a solid's elements (cells or springs).
 
     Args:
         elements: numbers of the elements, increasing, (k,).

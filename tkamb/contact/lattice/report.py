@@ -100,7 +100,7 @@ def edge_flags(
 
 
 def _sharpness(normals: NDArray[np.float64]) -> str:
-    """Return in words how the femoral surface turns or ends around a peak; "" if it is smooth."""
+    """Return in words how the femoral surface turns or ends; "" if it is smooth."""
     if not np.isfinite(normals).all():
         return "ends"
     # The middle row is the normal at the peak itself.
@@ -163,7 +163,6 @@ def result_of(
     """Return the result of a solution.
 
     Args:
-        pose: pose at approach 0 of the solution, (4, 4).
         load: N, or None if the pose was given.
         gaps: vertical gaps at that pose, m, (c,).
         rule: rule for the area that a nodal force acts on.
@@ -206,7 +205,7 @@ def result_of(
 def _pressures(
     state: LatticeState, gaps: Array, solution: Solution, rule: PressureRule
 ) -> tuple[Array, Array, Array]:
-    """Return nodal forces (c, 3), N, pressures (c,), Pa, and the areas (c,) that they act on, m².
+    """Return forces (c, 3), N, pressures (c,), Pa, and their areas (c,), m².
 
     `gaps` are those of the undeformed insert at the final pose.
     """
@@ -221,12 +220,11 @@ def _pressures(
 
 
 def _gaps(state: LatticeState, pose: Array, gaps: Array, force: Array, solution: Solution) -> Array:
-    """Return the gaps (c,), m.
+    """Return (c,), m.
 
-    They are those of the deformed insert in and beside the contact, and where the undeformed bodies
+    They are of the deformed insert in and beside the contact, and where the undeformed bodies
     overlap; elsewhere `gaps` of the undeformed insert at this pose. The edge of contact depends on
-    the gaps beside it, but the candidates depend on the initial guess: so a gap there is computed
-    even if the node is no candidate.
+    those beside it, but the candidates on the initial guess: a gap there is computed for any node.
     """
     loaded: Mask = np.asarray(force.any(axis=1), bool)
     close = beside(state.surface.triangles, loaded) | loaded | (gaps < 0)
@@ -256,7 +254,7 @@ def gaps_of_others(state: LatticeState, pose: Array, nodes: Index, solution: Sol
 
 
 def _areas(state: LatticeState, gaps: Array, loaded: Mask, rule: PressureRule) -> Array:
-    """Return the area (c,), m², that each node's force acts on.
+    """Return the area (c,), m², of each node's force.
 
     By Sharma's rule, the nodes in contact have equal shares of the undeformed bodies' overlap.
     """
@@ -267,7 +265,7 @@ def _areas(state: LatticeState, gaps: Array, loaded: Mask, rule: PressureRule) -
 
 
 def beside(triangles: Index, in_contact: Mask) -> Mask:
-    """Return the mask (n,) of nodes out of contact that share a triangle with one in contact."""
+    """Return the nodes (n,) out of contact that share a triangle with one in it."""
     neighbours = np.zeros_like(in_contact)
     neighbours[triangles[in_contact[triangles].any(axis=1)]] = True
     return neighbours & ~in_contact

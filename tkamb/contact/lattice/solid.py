@@ -88,7 +88,7 @@ DIFFERENCE = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """The places of element matrices (of cells or springs) in the global matrix.
+    """The places of element matrices in the global matrix.
 
     Args:
         indptr: first block of each node's row, then the number of blocks, (n + 1,).
@@ -127,7 +127,6 @@ class Pattern:
 
 @compiled
 def _add_blocks(matrices: Array, slot: Index, blocks: Array) -> None:
-    """Add the (3, 3) blocks of matrices (k, 3p, 3p) to the blocks at `slot` (k, p²)."""
     count = matrices.shape[1] // 3
     for k in range(len(matrices)):
         for i in range(count):
@@ -140,7 +139,7 @@ def _add_blocks(matrices: Array, slot: Index, blocks: Array) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """Sums nodal vectors of elements (cells or springs), (c, p) nodes, to global ones."""
+    """Sums nodal vectors of elements, (c, p) nodes, to global ones."""
 
     elements: Index
     nodes: int
@@ -166,7 +165,6 @@ def elements_of(elements: NDArray[Any], chosen: Index | None) -> NDArray[Any]:
 
 @compiled
 def _add_up(parts: Array, elements: Index, chosen: Index, total: Array) -> None:
-    """Add vectors (k, p, 3) of the chosen elements (k,) to nodal vectors (n, 3)."""
     for k in range(len(chosen)):
         element = chosen[k]
         for corner in range(parts.shape[1]):
@@ -247,7 +245,7 @@ class Solid(ABC):
     def forces(self, displacement: Array) -> tuple[Array, Array, float]:
         """Return the internal forces of a displacement (n, 3), m, summed element by element.
 
-        They do not use the stored factor, whose rounding would hide the error of a solution.
+        The stored factor is not used: its rounding would hide the error of a solution.
 
         Returns:
             Internal forces f(u) (n, 3), N; norm of h = K u - f(u) of each element (k,), N; and

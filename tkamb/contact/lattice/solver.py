@@ -10,10 +10,9 @@ approach D with
 f_int are the internal forces of the displaced solid under its nonlinear law, p the femoral points.
 A pass is a modified Newton step with the factorised linear stiffness K; docs/lattice.md ("Solver")
 has its steps: rays, active set (`active_set.py`), displacement K u = f + h, residual r = f -
-f_int(u) and next loads h + s r (`nonlinear_balance.py`). At equilibrium the nonlinear loads h are K
-u - f_int(u). The softening s is the ratio of secant and tangent stiffness along u.
+f_int(u) and next loads h + s r (`nonlinear_balance.py`).
 
-Passes evaluate only the region of the softened elements. When the residual there is within the
+Passes evaluate only the region of the softened elements; when its residual is within the
 tolerances, the whole solid is measured: r from the law of every element, without K, and the gap
 with new rays at the displaced nodes. The iteration has converged when
 
@@ -27,9 +26,9 @@ approach, because an error du = e u leaves r = e K_T u. The load and lambda >= 0
 every pass.
 
 After `max_passes` an iteration that began with the loads of an earlier solution begins again
-without them; else `solve_by_newton` continues. This full Newton iteration is also the reference:
-every step factorises the tangent stiffness and solves the contact on its compliance. The two share
-only the contact conditions.
+without them; else `solve_by_newton` continues, whose steps factorise the tangent stiffness and
+solve the contact on its compliance. It is also the reference: only the contact conditions are
+shared.
 """
 
 from dataclasses import dataclass, replace
@@ -79,7 +78,7 @@ class Solution:
 
     @property
     def converged(self) -> bool:
-        """Whether the residual is within its tolerances and the active set stopped changing."""
+        """Whether all residuals are within their tolerances, with an unchanged active set."""
         return self.forces.converged
 
 
@@ -157,9 +156,9 @@ class SlidingNodes:
     """The femoral planes over the candidates, updated as the nodes slide.
 
     Each pass solves the contact on tangent planes, then new rays through the displaced nodes give
-    the next ones. The nodes can oscillate where the femoral normal turns quickly (a rim, a coarse
-    triangle); then the rays follow the nodes only part of the way. Points and displacement (m, 3),
-    m, are those of the undeformed candidates.
+    the next ones. Where the femoral normal turns quickly (a rim, a coarse triangle) the nodes can
+    oscillate; the rays then follow them only part of the way. Points and displacement (m, 3), m,
+    are those of the undeformed candidates.
     """
 
     def __init__(
@@ -195,10 +194,10 @@ class SlidingNodes:
         return relative_gap
 
     def gap(self, displacement: Array, forces: ContactForces) -> float:
-        """Return the largest distance of a displaced active node from the femoral surface.
+        """Return the largest distance of an active node from the femoral surface, or penetration of
+        another one.
 
-        Penetrations of other nodes count too. It is relative to the largest displacement of an
-        active node; inf if no node is active.
+        It is relative to the largest displacement of an active node; inf if no node is active.
         """
         planes = self._planes_over(self._points + displacement)
         return self._relative_gap(planes, displacement, forces)

@@ -57,8 +57,8 @@ class Tangent:
 class SourceNetwork(Solid):
     """Springs of equal stiffness, linear or with the material's curve; see `Solid`.
 
-    Cells (c, 8) are needed only for the strains that decide on flags. The material's Poisson's
-    ratio has no effect. `springs` (s, 2) are end nodes.
+    Cells (c, 8) are needed only for the strains that decide on flags; `springs` (s, 2) are end
+    nodes.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class SourceNetwork(Solid):
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
         """Return the sum of (d sigma/d eps) C n nᵀ of the springs, N/m, (3n, 3n).
 
-        As in Sharma (2008), it neglects that loaded springs turn.
+        It neglects that loaded springs turn, as in Sharma (2008).
         """
         if self.material.is_linear:
             return self.stiffness

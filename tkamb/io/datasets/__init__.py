@@ -1,7 +1,7 @@
-"""Measured data for the shipped scenes. Only `tkamb data get` downloads them.
+"""Measured data for the shipped scenes, which only `tkamb data get` downloads.
 
-Each data set lists its files, their SHA-256 and their published address. A file is checked by its
-SHA-256 before it is written. Repeating an interrupted download loads only the missing files.
+Each data set lists files with published address and SHA-256, which is checked before a file is
+written; a repeated download loads only missing files.
 """
 
 import json
@@ -26,9 +26,7 @@ class DataFile:
 
     Args:
         name: path in the data set's folder.
-        sha256: SHA-256 of the content, hexadecimal.
-        commit: commit of the repository; None: no published address is known.
-        path: path in the repository; None: no published address is known.
+        commit: commit of the repository; None, also in `path`: no published address is known.
     """
 
     name: str
@@ -45,7 +43,7 @@ class DataFile:
     def places(self, folder: Path) -> list[Path]:
         """Return the file's possible paths in a folder of downloads.
 
-        A path has the file's name in the data set or in the repository, with or without folders.
+        They are its names in the data set and in the repository, with or without folders.
         """
         names = [self.name, PurePosixPath(self.name).name]
         if self.path:
@@ -88,10 +86,8 @@ TIMEOUT_S = 30
 
 @dataclass
 class Got:
-    """Result of fetching a data set.
-
-    Args:
-        absent: names of files that were not found.
+    """Args:
+    absent: names of files that fetching did not find.
     """
 
     kept: list[str] = field(default_factory=list)
@@ -103,7 +99,6 @@ def download(dataset: Dataset, to: Path, url: str | None = None) -> Got:
     """Download the missing files of a data set.
 
     Args:
-        to: its folder; it is made if it does not exist.
         url: address of a mirror with the same paths; None: the data set's own address.
 
     Returns:
@@ -129,9 +124,6 @@ def download(dataset: Dataset, to: Path, url: str | None = None) -> Got:
 
 def take_from(dataset: Dataset, to: Path, folder: Path) -> Got:
     """Copy the missing files of a data set from a folder of downloads or a clone.
-
-    Args:
-        to: its folder; it is made if it does not exist.
 
     Returns:
         Names of the files. A file that is not in the folder counts as absent.

@@ -12,8 +12,9 @@ from tkamb.io.opensim.model import GROUND, Coordinate, Joint, OpenSimModel
 
 OTHER = {"right": "left", "left": "right"}
 SEGMENT_LENGTH = (0.15, 0.75)
-"""m: smallest and largest accepted length of thigh and shank. Chosen with a margin around 0.25 m (a
-child of six) and 0.6 m (the tallest adults)."""
+"""m: accepted lengths of thigh and shank, with a margin around 0.25 m (a child of six) and 0.6 m
+(the tallest adults).
+"""
 SUFFIX = {"right": ("_r", "_R", ".r"), "left": ("_l", "_L", ".l")}
 
 
@@ -22,16 +23,12 @@ class Leg:
     """A leg of a model.
 
     Args:
-        side: "right" or "left".
-        knee: the femorotibial joint.
         flexion: name of the knee's flexion coordinate; None if the knee has no rotation coordinate.
-        ankle: the joint below the tibia.
-        hip: the joint above the femur.
-        femur: names of the femur and of the bodies welded to it, the femur first.
-        tibia: names of the tibia and of the bodies welded to it, the tibia first.
+        ankle: joint below the tibia, as `hip` above the femur.
+        femur: names of the femur and of the bodies welded to it, the femur first, like `tibia`.
         patella: name of the patella; None if the model has no patella.
-        neutral: body -> (4, 4) pose in ground in the neutral position. There the knee flexion is
-            zero, and all other coordinates have their default values.
+        neutral: body -> (4, 4) pose in ground at zero knee flexion, with default values of all
+            other coordinates.
     """
 
     model: OpenSimModel
@@ -55,9 +52,8 @@ class Leg:
     def knee_centre(self) -> Array:
         """(3,) m, the knee's centre in ground in the neutral position.
 
-        The centre is the origin of the knee joint's frame on the femur. In Delp's models this
-        origin is at the hip, because the joint's translation includes the thigh's length. Then the
-        centre is the origin of the joint's frame on the tibia.
+        It is the origin of the knee joint's frame on the femur, or on the tibia in Delp's models,
+        where the former is at the hip because the joint's translation includes the thigh's length.
         """
         hip = transform(self.neutral[self.hip_centre[0]], self.hip_centre[1])
         for group in (self.femur, self.tibia):
@@ -82,7 +78,6 @@ def find_leg(model: OpenSimModel, side: str, knee: str | None = None) -> Leg:
     """Return the left or right leg of a model.
 
     Args:
-        side: "right" or "left".
         knee: name of the femorotibial joint; None: the joint with "knee" or "femorotibial" in its
             name.
     """
@@ -148,10 +143,8 @@ def _joints(
 
 
 def _unread_joint(model: OpenSimModel, bodies: Iterable[str] = ()) -> InputError | None:
-    """Return the error of the first joint that could not be read, or None.
-
-    Args:
-        bodies: the joint must concern one of these bodies; empty: any joint counts.
+    """Return the error of the first unread joint, which concerns one of some bodies (any if empty),
+    or None.
     """
     names = {joint.name for joint in model.joints}
     for element in model.unread:
@@ -236,7 +229,7 @@ def _moving(model: OpenSimModel) -> list[Joint]:
 
 
 def _rigid_groups(model: OpenSimModel) -> dict[str, set[str]]:
-    """Return body -> set of the bodies that are welded to it, and the body itself."""
+    """Return body -> the bodies welded to it, with itself."""
     groups = {body: {body} for body in (GROUND, *model.bodies)}
     moving = _moving(model)
     for joint in model.joints:
@@ -282,7 +275,7 @@ def _single_joint(
 
 
 def _end(joint: Joint, group: tuple[str, ...]) -> tuple[str, Array]:
-    """Return the body of a group that a joint connects, and the joint's origin (3,) m in it."""
+    """Return the body of a group that a joint connects, and its origin (3,) m there."""
     if joint.parent in group:
         return joint.parent, joint.pose_parent_frame[:3, 3]
     return joint.child, joint.pose_child_frame[:3, 3]

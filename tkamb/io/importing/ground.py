@@ -47,9 +47,9 @@ class ExternalForce:
 
 
 def with_external_loads(request: ImportRequest, foot: tuple[str, ...]) -> ImportRequest:
-    """Return a request whose list of external loads is replaced by its table and the foot's forces.
+    """Return a request with a list of external loads replaced by its table and the foot's forces.
 
-    A request without such a list does not change. `foot` are the names of the foot's bodies.
+    `foot` are the names of the foot's bodies.
     """
     if request.grf is None or request.grf.suffix.lower() != ".xml":
         return request
@@ -138,7 +138,6 @@ def find_ground(request: ImportRequest, leg: Leg, axes: str, feet: Feet | None) 
 
     Args:
         axes: axes of the recording and table that point forward, up and right.
-        feet: positions of the feet; None: unknown.
     """
     request, side = with_external_loads(request, leg.foot), leg.side
     if request.grf is not None:
@@ -185,11 +184,7 @@ def _from_plates(request: ImportRequest, side: str, axes: str, feet: Feet) -> Fo
 def _from_table(
     request: ImportRequest, path: Path, side: str, axes: str, feet: Feet | None
 ) -> FoundGround:
-    """Return a foot's ground reaction from the forces of a table.
-
-    The forces are chosen by the option --grf-force, else by their names, else by their points of
-    application.
-    """
+    """They are chosen by --grf-force, by name, or by point of application."""
     table = read_table(path)
     forces = table_forces(table)
     time = table.time()
@@ -230,11 +225,8 @@ def _from_table(
 
 
 def _axes_of_table(table: Table, forces: list[TableForce], axes: str) -> str:
-    """Return the table's axes that point forward, up and right.
-
-    These are usually the axes of the recording. If the recording's z points up and the largest
-    force of the table is along y, the table has OpenSim's axes: its x, y, z are the recording's
-    x, z, -y.
+    """These are usually the recording's axes that point forward, up and right; but OpenSim's x, y,
+    z are its x, z, -y if its z points up and the table's largest force is along y.
     """
     if not forces or axes.split(",")[1][-1] != "z":
         return axes
@@ -253,7 +245,7 @@ def _axes_of_table(table: Table, forces: list[TableForce], axes: str) -> str:
 def _named(
     forces: list[TableForce], side: str, source_name: str | None, table: Table
 ) -> list[TableForce]:
-    """Return the forces of --grf-force, or else the one force with the foot's name, or else []."""
+    """Return the forces of --grf-force, or the one with the foot's name, or []."""
     names = ", ".join(force.name for force in forces) or "none"
     if source_name is not None:
         chosen = []
@@ -298,11 +290,7 @@ def _recorded(table: Table, force: TableForce, axes: str) -> RecordedForce:
 def _table_file(
     path: Path, axes: str, chosen: list[TableForce], recorded: list[RecordedForce]
 ) -> GroundFile:
-    """Return the scene's source of the ground reaction.
-
-    One force is read from its columns in the user's table. Several forces are summed in a new
-    table.
-    """
+    """One force is read from the user's table, several are summed in a new one."""
     if len(chosen) == 1:
         names = chosen[0].columns
         columns = (("time", "time"), *((k, names[k]) for k in COLUMNS[1:] if k in names))
@@ -327,9 +315,8 @@ def _summed(recorded: list[RecordedForce], path: Path) -> str:
 def common_interval(
     time: Array, interval: Interval | None, span: Interval | None
 ) -> tuple[Interval | None, list[str]]:
-    """Return the interval that the motion and the ground reaction share.
-
-    A list with one remark is returned too if this interval is shorter than the requested one.
+    """Return the interval shared by motion and ground reaction, and a remark if it is shorter than
+    the requested one.
 
     Args:
         time: times of the motion, s, shape (n,).
@@ -424,12 +411,7 @@ STEP_S = 0.02
 
 
 def check_clocks(forces: list[RecordedForce], feet: Feet, side: str, path: Path) -> None:
-    """Raise an InputError if the forces lie under the foot only with their clock shifted.
-
-    Args:
-        forces: the forces of this foot, in the laboratory.
-        side: side of the foot, "left" or "right".
-    """
+    """Raise an InputError if this foot's forces lie under it only with a shifted clock."""
     time, point = _loaded_points(forces)
     middle = feet.middles[side]
     if not len(time) or not np.isfinite(middle).any():
@@ -452,7 +434,7 @@ def check_clocks(forces: list[RecordedForce], feet: Feet, side: str, path: Path)
 
 
 def _loaded_points(forces: list[RecordedForce]) -> tuple[Array, Array]:
-    """Return times (n,) s and centres of pressure (n, 3) m of some loaded samples."""
+    """Return times (n,), s, and centres of pressure (n, 3), m, under load."""
     times = [force.time[force.loaded] for force in forces]
     points = [force.point[force.loaded] for force in forces]
     time, point = np.concatenate(times), np.concatenate(points)
@@ -461,9 +443,8 @@ def _loaded_points(forces: list[RecordedForce]) -> tuple[Array, Array]:
 
 
 def _distance(time: Array, point: Array, clock: Array, middle: Array) -> tuple[float, float]:
-    """Return the distance (m) that `percentile` of the points keep from the foot, and their share.
-
-    The distance is horizontal. Only points at times of the motion count; the share is theirs.
+    """Return the horizontal distance (m) that `percentile` of the points keep from the foot, and
+    the share of the points at times of the motion, which alone count.
 
     Args:
         time: (n,) s, times of the points.

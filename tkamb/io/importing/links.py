@@ -35,7 +35,7 @@ class MeshFrame:
 
     Args:
         pose: pose_mesh_in_body, shape (4, 4); None: at the body's origin, with anatomical axes.
-        why: words for the report on how the frame was identified.
+        why: words on how the frame was identified, for the report.
     """
 
     body: str
@@ -91,7 +91,7 @@ def mesh_frame(leg: Leg, part: str, wished_name: str | None) -> MeshFrame:
 
 
 def quarter_turn(rotation: Array) -> tuple[Array, float]:
-    """Return the nearest rotation (3, 3) by multiples of 90 deg, and the angle to it, rad."""
+    """Return the nearest rotation (3, 3) by multiples of 90 deg, and the angle, rad."""
     turns = Rotation.create_group("O")
     angles = (turns.inv() * Rotation.from_matrix(rotation)).magnitude()
     nearest = int(np.argmin(angles))
@@ -100,18 +100,15 @@ def quarter_turn(rotation: Array) -> tuple[Array, float]:
 
 @dataclass(frozen=True, eq=False)
 class Links:
-    """The links of a leg. Poses are (4, 4) matrices, in m.
+    """The links of a leg. Poses are (4, 4) matrices, in m, in the link's body.
 
     Args:
-        femur: pose of the femur link in the femur's body.
-        tibia: pose of the tibia link in the tibia's body.
-        patella: pose of the patella link in the patella's body; None without a patella.
+        patella: pose of the patella link; None without a patella.
         insert_in_tibia: pose of the insert frame in the tibia link.
         button_in_patella: pose of the button's mesh, turned to anatomical axes, in the patella
             link; None without a button.
         patella_error: angle between the axes of the patella link and the femur link in the neutral
             position, rad.
-        remarks: lines for the report on the pose of the implant.
     """
 
     leg: Leg
@@ -136,7 +133,7 @@ class Links:
         raise InputError(f"body '{body}' is not part of any link of the leg", leg.model.name)
 
     def point_in_link(self, body: str, point: Array) -> tuple[str, Array]:
-        """Return the link that moves with a body, and the coordinates (3,) m of a point in it."""
+        """Return the link that moves with a body, and a point (3,), m, in it."""
         link, offset = self.body_in_link(body)
         return link, transform(offset, point)
 
@@ -178,7 +175,6 @@ def find_links(
             anatomical axes about its origin, shape (4, 4); None without an implant.
         axes: axes of the meshes that point anterior, superior and right.
         frames: part of the implant -> name of its mesh's frame; None: inferred from the names.
-        with_button: whether the implant has a patellar button.
     """
     turn = pose(axes_rotation(axes), np.zeros(3))
     text: list[str] = []
@@ -204,7 +200,7 @@ def find_links(
 def _anatomical(
     leg: Leg, frame: MeshFrame, body: str, turn: Array, part: str, remarks: list[str]
 ) -> Array:
-    """Return the pose (4, 4) in a body of a part, turned to anatomical axes."""
+    """Return the pose (4, 4) in a body, turned to anatomical axes."""
     assert frame.pose is not None
     pose = leg.in_body(frame.body, body) @ frame.pose @ inverse(turn)
     nearest, _ = quarter_turn(pose[:3, :3])
@@ -247,21 +243,18 @@ def _patella(
 
 
 RESERVED = ("ground", "tibia", "femur", "patella", "hip")
-"""Names of links in docs/patient.md. A body with such a name becomes a link with suffix `_bone`."""
+"""Links in docs/patient.md; a body with such a name becomes a link with suffix `_bone`."""
 
 _LIMIT = '<limit lower="-10" upper="10" effort="1e6" velocity="1e3"/>'
 
 
 def body_link(body: str) -> str:
-    """Return the name of the link in the URDF that represents a body of the model."""
+    """Return the link of a body in the URDF."""
     return f"{body}_bone" if body in RESERVED else body
 
 
 def link_inertias(links: Links, scale: float) -> dict[str, RigidInertia]:
-    """Return name of a link -> its inertia in the link's frame.
-
-    The tibia link includes the foot, with the ankle at its neutral angle.
-    """
+    """Return link -> its inertia; the tibia includes the foot, with a neutral ankle."""
     leg = links.leg
     groups = {
         "tibia": (leg.tibia[0], links.tibia, (*leg.tibia, *leg.foot)),
@@ -283,11 +276,7 @@ def _body_inertia(
 
 
 def patient_urdf(links: Links, scale: float, comment: str) -> str:
-    """Return the text of the URDF.
-
-    Args:
-        scale: factor on the model's masses.
-    """
+    """Return the URDF, with masses scaled by `scale`."""
     leg = links.leg
     inertias = link_inertias(links, scale)
     lines = ['<?xml version="1.0"?>', f"<!-- {comment.replace('--', '- -')} -->"]

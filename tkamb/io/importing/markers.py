@@ -26,7 +26,7 @@ class ModelSegment:
         missing: names of the model's markers that are not visible in the recording.
         joined_to: neighbouring segment: "shank" for the foot, "thigh" for the pelvis, else "".
         joint: ball joint with the neighbouring segment, in the link of that segment, m, shape (3,).
-        centre: the same ball joint in the body of foot or pelvis, m, shape (3,).
+        centre: the same ball joint in the body of foot or pelvis, m, (3,).
     """
 
     name: str
@@ -40,7 +40,7 @@ class ModelSegment:
 def model_segments(
     links: Links, recorded: Table, without: Sequence[str] = ()
 ) -> list[ModelSegment]:
-    """Return the segments with at least three markers: shank, thigh, and possibly foot, pelvis."""
+    """Return shank and thigh, and possibly foot and pelvis, with at least three markers."""
     result = seen_segments(links, recorded, without)
     for name in ("shank", "thigh"):
         segment = result[name]
@@ -66,7 +66,7 @@ def model_segments(
 def seen_segments(
     links: Links, recorded: Table, without: Sequence[str] = ()
 ) -> dict[str, ModelSegment]:
-    """Return shank, thigh, foot and pelvis with the markers that are visible in any frame."""
+    """Return the four segments with the markers visible in any frame."""
     leg = links.leg
     joints = {"foot": (np.zeros(3), leg.ankle_centre), "pelvis": (links.hip, leg.hip_centre)}
     labels, dropped = _seen_labels(recorded, without)
@@ -95,9 +95,9 @@ def placed_markers(links: Links, points: Mapping[str, Mapping[str, Array]]) -> O
     """Return the leg's model with its markers at given positions.
 
     Args:
-        points: "shank", "thigh", "foot" or "pelvis" -> label -> position of the marker, m, shape
-            (3,), as in `ModelSegment`. Labels match the model's markers as in `matched_labels`.
-            Other segments and markers keep the model's positions.
+        points: segment ("shank", "thigh", "foot" or "pelvis") -> label -> position, m, (3,), as in
+            `ModelSegment`. Labels match as in `matched_labels`; all others keep the model's
+            positions.
     """
     leg, placed = links.leg, dict(links.leg.model.markers)
     for name, bodies, joined_to in _bodies(leg):
@@ -135,7 +135,7 @@ def _seen_labels(recorded: Table, without: Sequence[str]) -> tuple[list[str], li
 
 
 def segments_of(recorded: Table, segments: list[ModelSegment]) -> list[ModelSegment]:
-    """Return the segments with another recording's labels, without markers that it lacks."""
+    """Return the segments with another recording's labels, without those that it lacks."""
     labels = recorded_labels(recorded)
     result = []
     for segment in segments:
@@ -152,7 +152,7 @@ def _equal_line(recorded: Table) -> str:
 
 
 def _clashing_prefixes(labels: list[str], needed: Sequence[str]) -> list[str]:
-    """Return the prefixes of those needed markers whose plain label has several prefixes."""
+    """Return the prefixes of needed markers whose plain label has several."""
     plain = {plain_label(name) for name in needed}
     result: dict[str, list[str]] = {}
     for label in labels:
@@ -193,10 +193,8 @@ class Facing:
 
     Args:
         axes: axes of the file that point forward, up and right, like "-x,+z,+y".
-        up_deg: angle between the file's upward axis and the mean upward axis of shank, thigh and
-            pelvis, deg; NaN if the user stated the axes.
-        forward_deg: angle between the file's forward axis and the segments' mean forward axis in
-            the horizontal plane, deg; NaN if the user stated the axes.
+        up_deg: angle between the file's upward axis and the segments' mean one, deg; NaN if the
+            user stated the axes, like `forward_deg`, in the horizontal plane.
     """
 
     axes: str
@@ -205,10 +203,10 @@ class Facing:
 
 
 def facing(segments: list[ModelSegment], recorded: Table) -> Facing:
-    """Return the directions of the recording's axes, from the poses of thigh, shank and pelvis.
+    """Return the directions of the recording's axes by thigh, shank and pelvis.
 
-    In each segment y points up and x forward. The function averages these axes over all frames and
-    segments, and returns the nearest axes of the file.
+    In each segment y points up and x forward; the mean over frames and segments decides the nearest
+    axes of the file.
     """
     upright = [s for s in segments if s.name in ("shank", "thigh", "pelvis")]
     turns = []
@@ -249,11 +247,7 @@ def _axis_name(axis: Array) -> str:
 
 
 def feet(leg: Leg, recorded: Table, other: str) -> dict[str, list[str]]:
-    """Return side -> labels of the foot's markers, [] for a foot that the model lacks.
-
-    Args:
-        other: the other side, "left" or "right".
-    """
+    """Return side -> labels of the foot's markers, [] for a foot that the model lacks."""
     labels = recorded_labels(recorded)
     result = {leg.side: _foot_labels(leg, labels)}
     try:

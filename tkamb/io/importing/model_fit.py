@@ -1,8 +1,7 @@
 """Least-squares fit of an OpenSim model to markers, as in OpenSim's InverseKinematicsTool.
 
-All coordinates are free, except locked ones and the dependent ones of couplers. The ranges of
-coordinates are not imposed. This module computes residuals and derivatives.
-`tkamb.io.recordings.inverse_kinematics` solves the least-squares problem.
+All coordinates are free, except locked ones and the dependent ones of couplers; ranges are not
+imposed. This module gives residuals and derivatives to `tkamb.io.recordings.inverse_kinematics`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -63,11 +62,11 @@ class ModelChain:
         )
 
     def default(self, frames: int) -> Array:
-        """Return the default values (f, n) of the n coordinates for f frames."""
+        """Return the default coordinates (f, n) for f frames."""
         return np.tile(self.kinematics.coupled({}), (frames, 1))
 
     def places(self, state: Array) -> Array:
-        """Return the positions (f, m, 3) m of the markers in ground."""
+        """Return the marker positions (f, m, 3), m, in ground."""
         return self._markers_at(self.kinematics.poses(state))
 
     def _markers_at(self, poses: Array) -> Array:
@@ -87,8 +86,8 @@ class ModelChain:
             residuals' curvature_ij = -Σ w r · (a_i × u_j) = -a_i · Σ w u_j × r,   r = p - x
 
         Each coordinate therefore needs only the sums Σ w, Σ w x, Σ w x xᵀ, Σ w r and Σ w x rᵀ over
-        the markers that it moves. The markers' Jacobians are not computed. The curvature of the
-        joints' splines is neglected.
+        the markers that it moves, not the markers' Jacobians. The curvature of the joints' splines
+        is neglected.
 
         Args:
             state: coordinates, rad and m, shape (f, n).
@@ -117,13 +116,12 @@ class ModelChain:
         )
 
     def _assembled(self, state: Array, twists: Array, sums: Array, cost: Array) -> NormalEquations:
-        """Return the normal equations of the free coordinates.
+        """Return the equations of the free coordinates, at a state (f, n).
 
         Args:
-            state: coordinates, rad and m, shape (f, n).
             twists: twists of the moving coordinates, shape (f, k, 6).
-            sums: sums over the markers that each coordinate moves, shape (f, k, 25).
-            cost: weighted sum of squared distances, m², shape (f,).
+            sums: sums over the markers that each coordinate moves, (f, k, 25).
+            cost: weighted sum of squared distances, m², (f,).
         """
         a, b = twists[..., :3], twists[..., 3:]
         weight, first, pull = sums[..., :1], sums[..., 1:4], sums[..., 4:7]
@@ -147,16 +145,15 @@ class ModelChain:
         )
 
     def _symmetric(self, matrix: Array) -> Array:
-        """Return the symmetric matrix (f, n, n). Only entries with i before j are read."""
+        """Return the symmetric matrix (f, n, n), of which only i before j is read."""
         upper = matrix * self._above
         return np.asarray(upper + upper.swapaxes(1, 2))
 
     def _free_part(self, values: Array, state: Array) -> Array:
         """Return the rows, and for a square matrix also the columns, of the free coordinates.
 
-        By the chain rule, the row of a dependent coordinate is multiplied by the slope of its
-        coupler and added to the row of the independent coordinate. The same holds for columns. In
-        a series of couplers the last is added first.
+        By the chain rule, the row (and column) of a dependent coordinate times its coupler's slope
+        is added to that of the independent one, in a series of couplers the last one first.
         """
         square, free = values.shape[1] == values.shape[2], len(self.free)
         for dependent, independent, coordinate, function in reversed(self._after):
@@ -177,15 +174,12 @@ class ModelChain:
         return np.asarray(state[frames])
 
     def replaced(self, state: Array, frames: Index, part: Array) -> Array:
-        """Return the coordinates of all frames, with `part` in the chosen frames."""
+        """Return the coordinates with `part` in the chosen frames."""
         return put(state, frames, part)
 
 
 def _tree(kinematics: Kinematics, at: Sequence[int]) -> tuple[Array, Array]:
-    """Return the markers and the coordinate axes that each coordinate moves.
-
-    Args:
-        at: index of each marker's body.
+    """Return which markers (of bodies `at`) and axes each coordinate moves.
 
     Returns:
         Matrix (n, m): 1 where coordinate i moves marker j, else 0. Matrix (n, n): 1 where
@@ -230,7 +224,7 @@ def fit_model(
     """Return a model's chain and its fit to all frames of a recording.
 
     Args:
-        weights: name of a marker -> weight of its squared distance; default 1.
+        weights: marker -> weight of its squared distance; default 1.
         laboratory_axes: axes of the file that point along the model's ground x, y and z (forward,
             up and right), like "-x,+z,+y".
 
@@ -263,7 +257,7 @@ def fit_model(
 def fit_in_blocks(
     chain: ModelChain, measured: Array, weights: Array, start: Array
 ) -> ChainFit[Array]:
-    """Return the fit of many frames, computed in blocks of `block_frames`."""
+    """Return the fit of many frames, in blocks of `block_frames`."""
     parts = [slice(k, k + BLOCK_FRAMES) for k in range(0, len(measured), BLOCK_FRAMES)]
     fits = [fit_chain(chain, measured[part], weights, start[part]) for part in parts]
     state, rms, distance, solved = (

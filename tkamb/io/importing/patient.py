@@ -49,8 +49,9 @@ SAME_MASS_SHARE = 0.01
 
 
 LEG_SHARES = (0.10, 0.25)
-"""Smallest and largest accepted share of one leg in the body's mass. Winter (2009) gives 0.161, de
-Leva (1996) 0.20. The margin allows for individual differences."""
+"""Accepted shares of one leg in the body's mass, with a margin for individuals: Winter (2009) gives
+0.161, de Leva (1996) 0.20.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,8 +186,8 @@ def _trial(request: ImportRequest, leg: Leg, links: Links, insert: Surface | Non
 def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[str, ...]:
     """Write URDF and scene, load them as a check, and return remarks on markers and gait.
 
-    Existing files do not change. Scenes may share a file with the same content. If an error occurs,
-    all new files are removed.
+    Existing files do not change, and scenes may share one with the same content; after an error all
+    new files are removed.
     """
     scene = folder / name
     if os.path.lexists(scene):
@@ -246,7 +247,7 @@ def _same_there(path: Path, text: str) -> bool:
 
 
 def marker_lines(case: Case) -> tuple[str, ...]:
-    """Return lines on the marker fits "segments" and "chain" and on the knee centres' distance."""
+    """Return lines on both marker fits and the distance of the knee centres."""
     result = case.motion.markers
     if result is None:
         rms = case.tibia.residual if case.tibia else None
@@ -278,7 +279,7 @@ def marker_lines(case: Case) -> tuple[str, ...]:
 
 
 def _mass_scale(request: ImportRequest, leg: Leg) -> tuple[float, str]:
-    """Return the factor on the model's masses, and a remark on it."""
+    """Return the factor on the masses, and a remark."""
     model, subject = leg.model.mass_kg, request.mass_kg
     leg_mass = sum(leg.model.bodies[b].mass_kg for b in (*leg.femur, *leg.tibia, *leg.foot))
     if leg_mass <= 0.0:
@@ -304,12 +305,10 @@ def _mass_scale(request: ImportRequest, leg: Leg) -> tuple[float, str]:
 def _leg_scale(request: ImportRequest, leg_mass: float) -> tuple[float, str]:
     """Return the factor on the masses of a model of one leg, and a remark on it.
 
-    Such a model has the mass of a leg, or of the whole body if a scaling tool scaled it to the
-    subject's mass. If the factor is not 1, the leg gets the share `LEG_MASS_SHARE` of
-    the subject's mass.
+    The model has the mass of a leg, or of the whole body if a scaling tool scaled it to the
+    subject's; if the factor is not 1, the leg gets `LEG_MASS_SHARE` of the subject's mass.
 
     Args:
-        request: the import, with the subject's mass.
         leg_mass: mass of thigh, shank and foot in the model, kg.
     """
     subject = request.mass_kg

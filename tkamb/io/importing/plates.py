@@ -1,10 +1,10 @@
 """Assignment of recorded forces to the feet, and the interval in which a foot's load is measured.
 
-The forces are from the plates of a C3D file, or from a table of ground reactions. Programs name the
-columns of such a table in many ways: `ground_force_1_vx`, `1_ground_force_px`,
-`ground_torque_1_y`, `ground_moment_1_mx`, `ground_force_calcn_r_mx`, `f1_1`, `FP2_tz`. A column
-name contains the kind (force, point, moment), the axis, and the name of a force. A moment column
-whose name fits no force is an error, unless every force of the table has a moment of its own.
+They are from the plates of a C3D file, or from a table, whose columns programs name in many ways:
+`ground_force_1_vx`, `1_ground_force_px`, `ground_torque_1_y`, `ground_moment_1_mx`,
+`ground_force_calcn_r_mx`, `f1_1`, `FP2_tz`. A column name contains the kind (force, point, moment),
+the axis, and the name of a force. A moment column whose name fits no force is an error, unless
+every force of the table has a moment of its own.
 """
 
 import re
@@ -39,14 +39,14 @@ class TableForce:
 
     Args:
         name: common beginning of the column names.
-        columns: role of a column in a scene, like "force_1" or "moment_2" -> name of the column.
+        columns: role in a scene, like "force_1" or "moment_2" -> name of the column.
     """
 
     name: str
     columns: dict[str, str] = field(default_factory=dict)
 
     def has(self, kind: str) -> bool:
-        """Return whether the force has all three columns of a kind: force, point or moment."""
+        """Return whether all three columns of a kind (force, point, moment) exist."""
         return all(f"{kind}_{k}" in self.columns for k in (1, 2, 3))
 
     @property
@@ -118,7 +118,7 @@ def _refuse_unassigned(table: Table, unassigned: list[_Column], forces: list[Tab
 
 
 def _parsed_column(name: str) -> _Column | None:
-    """Return the parts of a column's name, or None if it is no force, point or moment."""
+    """Return a column's parts, or None if it is no force, point or moment."""
     plain = name.lower().rstrip()
     if match := _NUMBERED.fullmatch(plain):
         kind, owner, axis = match.groups()
@@ -180,8 +180,8 @@ class RecordedForce:
 
     Args:
         key: number of the plate, or name of the table's force.
-        time: times, s, shape (k,).
-        wrench: force (N) and moment (N·m) about the laboratory's origin, shape (k, 6).
+        wrench: force (N) and moment (N·m) about the laboratory's origin, (k, 6), at the times
+            `time` (k,), s.
         level: height of the plate's surface, m.
         drift: vertical force that the unloaded plate reads, N.
     """
@@ -229,7 +229,6 @@ class Load:
         plate: number of the plate, or name of the table's force.
         side: "left" or "right" foot; "": no foot's markers are near.
         start: time of the load's first sample, s.
-        end: time of the load's last sample, s.
         distance: median distance from the centre of pressure to the nearest foot's markers, m.
         other: median distance to the other foot's markers, m; NaN without such markers.
         surface: approximate height of the step under the foot above the plate, m; 0: no step.
@@ -261,7 +260,7 @@ class Feet:
 
 
 def marked_feet(recorded: Table, axes: str, labels: dict[str, list[str]]) -> Feet:
-    """Return the positions of the feet in a recording of markers.
+    """Return the positions of the feet by their markers.
 
     Args:
         axes: axes of the file that point forward, up and right, like "-x,+z,+y".
@@ -308,7 +307,7 @@ def feet_loads(forces: list[RecordedForce], feet: Feet) -> list[Load]:
 def _load(
     source: RecordedForce, time: Array, point: Array, force: Array, middles: dict[str, Array]
 ) -> Load:
-    """Return a load. On a step, the centre of pressure is where the force's line meets the step."""
+    """On a step, the centre of pressure is where the force's line meets the step."""
     distances, surface = {}, {}
     for side, middle in middles.items():
         above = middle[:, 1] - point[:, 1]
@@ -328,11 +327,7 @@ def _load(
 def own_plates(
     loads: list[Load], side: str, path: Path, hint: str = "give --plates and --interval"
 ) -> tuple[int | str, ...]:
-    """Return the plates on which only this foot stood.
-
-    Args:
-        side: "left" or "right".
-    """
+    """Return the plates on which only this foot stood."""
     foot_plates = list(dict.fromkeys(load.plate for load in loads if load.side == side))
     others = {load.plate for load in loads if load.side != side}
     shared = [load.title for load in loads if load.plate in foot_plates and load.plate in others]
@@ -382,7 +377,7 @@ def common_surface(loads: list[Load], plates: tuple[int | str, ...]) -> float:
 def known_interval(
     loads: list[Load], plates: tuple[int | str, ...], feet: Feet
 ) -> tuple[float, float]:
-    """Return the times, s, of the first and last frame between the foot's first and last load."""
+    """Return the times, s, of the first and last frame of the foot's loads."""
     foot_loads = [load for load in loads if load.plate in plates]
     start = min(load.start for load in foot_loads)
     end = max(load.end for load in foot_loads)
@@ -403,7 +398,7 @@ def unmeasured(
     side: str,
     interval: tuple[float, float],
 ) -> Array:
-    """Return the times, s, within an interval at which the foot is nearly still but on no plate."""
+    """Return the times, s, at which the foot is nearly still but on no plate."""
     time = feet.time
     speed = np.linalg.norm(np.gradient(feet.middles[side], time, axis=0), axis=1)
     loaded = np.zeros(len(time), bool)
@@ -415,7 +410,7 @@ def unmeasured(
 
 
 def _middle(table: Table, labels: list[str]) -> Array:
-    """Return the mean position (n, 3) m of the visible markers; NaN where none is visible."""
+    """Return the mean position (n, 3) m of visible markers; NaN without any."""
     rows = table.rows
     if not labels:
         return np.full((rows, 3), np.nan)

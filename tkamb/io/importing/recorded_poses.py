@@ -1,8 +1,7 @@
 """Knee and shank poses: recorded poses of the components, or coordinates of an OpenSim model.
 
-Fluoroscopy or biplane X-ray gives the poses of the component, but not the pose of the leg in the
-laboratory. The shank's pose comes from its markers, and from joint centres that are fixed to the
-neighbouring segments' markers.
+Fluoroscopy or biplane X-ray gives no pose of the leg in the laboratory: the shank's comes from its
+markers, and from joint centres fixed to the neighbouring segments' markers.
 """
 
 from collections.abc import Mapping
@@ -56,7 +55,6 @@ class ModelMotion:
         time: times, s, shape (n,).
         values: values of `COLUMNS`, mm and deg, shape (n, 12).
         missing: coordinates of the model that the file lacks. They have their default values.
-        remarks: lines for the report on how the file was read.
     """
 
     time: Array
@@ -88,10 +86,10 @@ class ModelMotion:
 
 
 def model_motion(links: Links, recorded: Table) -> ModelMotion:
-    """Return the motion of knee and shank from a motion in the model's coordinates.
+    """Return the motion of knee and shank from coordinates of the model.
 
     Args:
-        recorded: table of the coordinates. A column has the coordinate's name or path in the model.
+        recorded: columns have a coordinate's name or path in the model.
     """
     leg = links.leg
     kinematics = Kinematics(leg.model)
@@ -121,7 +119,7 @@ def model_motion(links: Links, recorded: Table) -> ModelMotion:
 
 
 def model_feet(links: Links, recorded: Table) -> Feet:
-    """Return the positions of the feet in a motion, as mean origin of each foot's bodies."""
+    """Return the feet's positions, the mean origin of each foot's bodies."""
     leg = links.leg
     kinematics = Kinematics(leg.model)
     q, _ = read_coordinates(kinematics, recorded)
@@ -162,8 +160,6 @@ class ShankMarkers:
     Args:
         axes: axes of the file that point forward, up and right.
         points: label of a marker -> its position in the tibia link, m, shape (3,).
-        centres: name of a joint centre -> the centre.
-        remarks: lines for the report on the joint centres.
     """
 
     path: Path
@@ -182,13 +178,12 @@ def shank_markers(
 ) -> ShankMarkers:
     """Return the points that give the shank's pose.
 
-    With at least three markers, the points are the shank's markers. Otherwise joint centres are
-    added: the ankle centre from at least three markers of the foot, and the knee centre from at
-    least three markers of the thigh. The position of the knee centre in the shank is its mean over
-    the recorded poses.
+    They are the shank's markers if there are three, otherwise joint centres are added: the ankle's
+    from three markers of the foot, the knee's from three of the thigh. The knee centre's place in
+    the shank is its mean over the recorded poses.
 
     Args:
-        segments: name of a segment -> its visible markers.
+        segments: segment -> its visible markers.
         femur: poses of the femur's body in the tibia link, m, shape (n, 4, 4).
         axes: axes of the file that point forward, up and right.
     """
@@ -210,7 +205,7 @@ def shank_markers(
 def _joint_centres(
     links: Links, segments: Mapping[str, ModelSegment], femur: Array
 ) -> tuple[dict[str, JointCentre], list[str]]:
-    """Return the joint centres from the markers of foot and thigh, and remarks on them."""
+    """Return joint centres by markers of foot and thigh, and remarks."""
     foot, thigh, leg = segments["foot"], segments["thigh"], links.leg
     centres: dict[str, JointCentre] = {}
     text = []
@@ -267,7 +262,7 @@ class PoseRecording:
         return dict(zip(ROLES, self.columns, strict=True))
 
     def keys(self) -> dict[str, Any]:
-        """Return the scene's table [motion] without file, cut-off frequency, interval, columns."""
+        """Return [motion] without file, cut-off frequency, interval, columns."""
         result: dict[str, Any] = {
             "interpretation": "pose",
             "sequence": self.sequence,
@@ -286,7 +281,6 @@ class RecordedPoses:
     """Recorded poses after reading.
 
     Args:
-        given: the table of poses.
         interval: start and end of the part to compute, s; None: the whole recording.
         time: times in the recording of markers, s, shape (n,).
         femur: poses of the femur's body in the tibia link, m, shape (n, 4, 4).
@@ -311,11 +305,10 @@ def read_poses(
 ) -> RecordedPoses:
     """Return recorded poses, converted to poses of the femur's body in the tibia link.
 
-    Let P be the recorded pose of the femoral mesh in the insert mesh. Then
-    T_femur_in_tibia = T_insert_in_tibia T_insert_mesh_in_insert P T_femur_in_femoral_mesh.
+    With the recorded pose P of the femoral mesh in the insert mesh, T_femur_in_tibia =
+    T_insert_in_tibia T_insert_mesh_in_insert P T_femur_in_femoral_mesh.
 
     Args:
-        recording: the table of poses.
         insert: mesh of the insert about its own origin, in anatomical axes.
         axes: axes of the meshes that point anterior, superior and right.
         cutoff_Hz: cut-off frequency of the scene's low-pass filter, Hz.

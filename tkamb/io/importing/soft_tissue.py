@@ -165,7 +165,7 @@ def _bundles(links: Links, remarks: list[str]) -> tuple[Bundle, ...]:
 def _wraps(
     links: Links, ligament: OpenSimLigament, ignored: dict[str, list[str]]
 ) -> tuple[WrapObject, ...]:
-    """Return the surfaces of a strand, and add reason -> strand of those that are left out."""
+    """Return a strand's surfaces, and add reason -> strand of those left out."""
     from tkamb.knee.taut_strings import inside  # imports numba
 
     result = []

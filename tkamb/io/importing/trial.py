@@ -58,11 +58,7 @@ from tkamb.units import DEGREE, MILLIMETRE
 def with_static_markers(
     scene: SceneText, static: Path, segments: list[ModelSegment], length_unit: str | None = None
 ) -> tuple[SceneText, list[str]]:
-    """Return the scene with marker positions from a standing trial, and remarks on them.
-
-    Args:
-        length_unit: unit of lengths in the trial; None: the unit that the file states.
-    """
+    """Return the scene with marker positions from a standing trial, and remarks on them."""
     assert scene.markers is not None
     marker_table = Scene.model_validate(tomllib.loads(scene.text())).motion.markers
     assert marker_table is not None
@@ -96,10 +92,10 @@ def calibrated_markers(
     side: Literal["right", "left"],
     pose_insert_in_tibia: Array,
 ) -> dict[str, dict[str, Array]]:
-    """Return calibrated positions: segment -> marker -> position in the segment, m, shape (3,).
+    """Return segment -> marker -> calibrated position in the segment, m, shape (3,).
 
-    The chain of the leg is fitted to the standing trial, with the marker positions of the table.
-    The calibrated position of a marker is its mean position in the fitted segment.
+    It is the marker's mean position in the segment of a leg chain fitted to the standing trial,
+    with the table's marker positions.
 
     Args:
         table: markers and joints of the scene. Markers that the trial lacks are ignored.
@@ -140,7 +136,6 @@ class Trial:
     """Motion and ground reaction of a recorded trial.
 
     Args:
-        ground: the ground reaction; None: none is modelled.
         markers: recording of markers; None: the motion is not from markers.
         motion: motion from the model's coordinates; None: the motion is not from coordinates.
         poses: recorded poses of the knee; None: the motion is not from poses.
@@ -240,7 +235,7 @@ def from_coordinates(request: ImportRequest, leg: Leg, links: Links, recorded: T
 
 
 def _notices(request: ImportRequest, recorded: Table) -> list[str]:
-    """Return notes on parts of the recording that are ignored or read in another way."""
+    """Return notes on parts that are ignored or read in another way."""
     remarks = recorded.remarks
     if recorded.path.suffix.lower() == ".c3d":
         remarks = read_c3d(recorded.path, request.units).remarks
@@ -275,10 +270,10 @@ def _segment_lines(segments: Iterable[ModelSegment], without: tuple[str, ...]) -
 def _thinned(
     time: Array, interval: tuple[float, float] | None, cutoff_Hz: float
 ) -> tuple[tuple[float, float], int | None, str]:
-    """Return the interval, the number of frames in it (None: all), and a remark on them.
+    """Return the interval, the number of frames in it (None: all), and a remark.
 
-    The frames are every k-th frame of the recording. Their rate is at least `frames_per_period`
-    times the cut-off frequency, if the recording allows.
+    They are every k-th of the recording, at least `frames_per_period` times the cut-off frequency
+    if it allows.
     """
     start, end = interval or (float(time[0]), float(time[-1]))
     inside = time[(time >= start - 1e-9) & (time <= end + 1e-9)]
@@ -327,8 +322,7 @@ def with_registered_markers(
 ) -> tuple[SceneText, Registration | None, list[str]]:
     """Return the scene with registered markers, the registration, and remarks on it.
 
-    Without `request.register` the markers are registered if they misfit the model. The registration
-    is None if they are not.
+    Without `request.register` they are registered if they misfit the model, else None is returned.
     """
     assert scene.markers is not None
     segments = list(scene.markers.segments)
@@ -362,7 +356,6 @@ def measured_markers(
     """Return segment -> measured markers (n, m, 3), m, of a recording, x forward and y up.
 
     Args:
-        request: the import, with its unit of length and marker prefix.
         segments: segments with their markers. A marker that the recording lacks is NaN.
         axes: axes of the file that point forward, up and right; None: from the markers.
     """
@@ -394,7 +387,7 @@ def moved_markers(
 ) -> list[str]:
     """Return the markers that sit elsewhere in another trial, and set them to NaN in `other`.
 
-    The distances of such a marker to most of the others of its segment differ between the trials.
+    Its distances to most others of its segment differ between the trials.
     """
     moved = []
     for segment in segments:
@@ -410,7 +403,7 @@ def moved_markers(
 
 
 def _distances(points: Array) -> Array:
-    """Return the median distances (m, m) of markers (n, m, 3), m; NaN if never seen together."""
+    """Return median distances (m, m) of markers (n, m, 3), m; NaN if never seen together."""
     apart = np.linalg.norm(points[:, :, None] - points[:, None], axis=3)
     seen = np.isfinite(apart).any(axis=0)
     result = np.full(seen.shape, np.nan)

@@ -1,9 +1,9 @@
 """XML of an OpenSim file and of the files that it includes.
 
-OpenSim's XML reader accepts a bare `&` in a text, bytes that are not UTF-8, `--` within a comment
-and text after the last element. tkamb reads such a file too, with a notice. An element with
-`file="other.xml"` is replaced by the element in the other file. If an element lacks a value, the
-value is read from the file's <defaults>.
+OpenSim's reader accepts a bare `&` in a text, bytes that are not UTF-8, `--` within a comment and
+text after the last element; tkamb does, too, with a notice. An element with `file="other.xml"` is
+replaced by the element in the other file. If an element lacks a value, the value is read from the
+file's <defaults>.
 """
 
 import copy
@@ -37,9 +37,8 @@ class Document:
 
     Args:
         defaults: name of a class -> element with the default values of the class.
-        partial: whether an element that cannot be read is added to `unread`; otherwise it is an
-            error.
-        unread: elements that could not be read, each with the reason.
+        partial: whether an element that cannot be read is added to `unread`, with the reason;
+            otherwise it is an error.
     """
 
     path: Path
@@ -49,7 +48,7 @@ class Document:
 
     @contextmanager
     def reading(self, element: Element) -> Iterator[None]:
-        """Run a block that reads an element. If `partial`, a block's error is added to `unread`."""
+        """Read an element in a block; if `partial`, its error is added to `unread`."""
         try:
             yield
         except InputError as error:
@@ -79,7 +78,7 @@ class Document:
         raise InputError(f"has no <{tags[0]}>", self.where(element))
 
     def socket(self, element: Element, name: str, *old_tags: str, default: str = "") -> str:
-        """Return the path or name of the object to which a socket of an element is connected.
+        """Return the path or name of the object at a socket.
 
         The tag depends on the file's version. Version 4 has <socket_NAME>. Versions 30508 to 30515
         have <connector_NAME_connectee_name> or <socket_NAME_connectee_name>. Earlier ones have
@@ -195,10 +194,9 @@ class Document:
 
 
 def _number_words(text: str, count: int | None) -> list[str]:
-    """Split a list of numbers into words.
+    """Split a list of numbers, like OpenSim's reader also `(0 1 0)`, `~[0,1,0]` and `0, 1, 0`.
 
-    Like OpenSim's reader, this function also splits `(0 1 0)`, `~[0,1,0]` and `0, 1, 0`. Commas
-    separate numbers only if they give `count` numbers. Otherwise they may be decimal commas.
+    Commas that do not give `count` numbers may be decimal commas.
     """
     if count is None or count < 2:
         return text.split()
@@ -214,7 +212,7 @@ MAX_NESTED_FILES = 5
 
 
 NOT_NEEDED = ("ControllerSet", "ProbeSet", "ContactGeometrySet", "AnalysisSet")
-"""Sets that tkamb does not model. Their files may be absent."""
+"""Sets that tkamb does not model; their files may be absent."""
 
 _BARE_AMPERSAND = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#[0-9]+|#x[0-9a-fA-F]+);)")
 _COMMENT = re.compile(r"<!--(.*?)-->", re.S)
@@ -224,7 +222,7 @@ _END = re.compile(r"</OpenSimDocument\s*>")
 
 
 def open_document(path: Path) -> tuple[Element, list[str]]:
-    """Return the root element of an OpenSim file after inclusion of further files, and notices."""
+    """Return a file's root element with included files, and notices."""
     notices: list[str] = []
     root = _read(path, notices)
     for element in root:
@@ -252,7 +250,7 @@ def _read(path: Path, notices: list[str]) -> Element:
 
 
 def _lenient(content: bytes) -> tuple[str, list[str]]:
-    """Return the text as strict XML without a declaration, and words on each repair."""
+    """Return strict XML without a declaration, and words on each repair."""
     repairs = []
     try:
         text = content.decode("utf-8-sig")
@@ -291,7 +289,7 @@ def _include(element: Element, path: Path, opened: tuple[Path, ...], notices: li
 def _replace(
     element: Element, name: str, path: Path, opened: tuple[Path, ...], notices: list[str]
 ) -> tuple[Path, tuple[Path, ...]]:
-    """Fill an element from the file that it includes. Return this file and all opened files."""
+    """Return the included file, and all opened files."""
     where = f"{path}: {element.tag} file='{name}'"
     included = path.parent / name.replace("\\", "/")
     if not included.is_file() and element.tag in NOT_NEEDED:

@@ -28,7 +28,7 @@ class Motion:
     """Poses and twists of bodies in ground, for coordinate sets of leading shape (...).
 
     Args:
-        bodies: name of a body -> its index; ground is first.
+        bodies: body -> its index; ground is first.
         poses: pose of each body in ground, shape (..., b, 4, 4).
         twists: twist of each body at ground's origin, per unit of each coordinate, shape
             (..., b, 6, n).
@@ -42,10 +42,9 @@ class Motion:
     axes: Array
 
     def points(self, bodies: Sequence[str], locations: ArrayLike) -> tuple[Array, Array]:
-        """Return positions of points in ground and their derivatives.
+        """Return positions of points on m named bodies in ground, and their derivatives.
 
         Args:
-            bodies: names of the m points' bodies.
             locations: points in the frames of their bodies, m, shape (m, 3) or (..., m, 3).
 
         Returns:
@@ -109,7 +108,7 @@ class Kinematics:
         self._signed_gradients = self._signs[:, None] * self._gradients
 
     def vector(self, q: Mapping[str, float] | ArrayLike) -> Array:
-        """Return coordinates (..., n). Those that are not in a mapping have default values."""
+        """Return coordinates (..., n), with default values for those not in a mapping."""
         if isinstance(q, Mapping):
             values = np.array([c.default for c in self.model.coordinates.values()])
             for name, value in q.items():
@@ -125,7 +124,7 @@ class Kinematics:
         return values
 
     def coupled(self, q: Mapping[str, float] | ArrayLike) -> Array:
-        """Return the coordinates (..., n) with dependent ones set by their couplers."""
+        """Return the coordinates (..., n) with dependent ones by their couplers."""
         values = self.vector(q).copy()
         for coupler in self.model.couplers:
             independent = values[..., self.coordinates[coupler.independent]]
@@ -135,7 +134,7 @@ class Kinematics:
     def coupling(self, q: ArrayLike) -> Array:
         """Return the derivatives (..., n, n) of all coordinates (rows) by the independent ones.
 
-        The column of a dependent coordinate is zero.
+        A dependent coordinate has a column of zeros.
         """
         values = self.vector(q)
         result = np.broadcast_to(np.eye(values.shape[-1]), (*values.shape, values.shape[-1])).copy()
@@ -167,10 +166,7 @@ class Kinematics:
         return Motion(self.bodies, poses, twists, axis_twists)
 
     def joint_twists(self, q: Array) -> tuple[Array, Array]:
-        """Return the poses of all bodies, and the twist that each coordinate gives to bodies.
-
-        Args:
-            q: coordinates, rad and m, shape (..., n).
+        """Return the poses of all bodies, and the twist of each coordinate of q (..., n).
 
         Returns:
             Poses in ground (..., b, 4, 4). Twists (..., n, 6) at ground's origin, per unit of each
@@ -209,8 +205,7 @@ class Kinematics:
     def _chain(self, values: Array) -> tuple[Array, Array]:
         """Return body poses (..., b, 4, 4), and the twist in ground (..., a, 6) of each axis.
 
-        The poses within all joints are computed at once. The poses of the bodies are computed one
-        by one from ground outwards.
+        The poses within joints are computed at once, those of bodies from ground outwards.
         """
         joint_poses, directions = self._joint_poses(values)
         steps = np.where(self._backwards, inverse(joint_poses), joint_poses)
@@ -264,7 +259,7 @@ class Kinematics:
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Return a × b of arrays (..., 3). For large arrays this is faster than `np.cross`."""
+    """Return a × b (..., 3), for large arrays faster than `np.cross`."""
     x, y, z = np.moveaxis(a, -1, 0)
     u, v, w = np.moveaxis(b, -1, 0)
     return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)

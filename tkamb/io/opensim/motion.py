@@ -35,12 +35,12 @@ def inverse_dynamics(
 ) -> Array:
     """Return the generalised forces τ (f, n), N·m and N, one for each coordinate.
 
-    Constraints and couplers are ignored: every coordinate counts as independent.
+    Every coordinate counts as independent, without constraints and couplers.
 
     Args:
         q: coordinates, rad and m, shape (f, n).
-        rates: first time derivatives of the coordinates, shape (f, n).
-        accelerations: second time derivatives of the coordinates, shape (f, n).
+        rates: first time derivatives, (f, n).
+        accelerations: second time derivatives, (f, n).
         wrenches: body -> moment (N·m) above force (N) on the body, in ground at ground's origin,
             shape (f, 6), for example the ground reaction on a foot.
     """
@@ -57,18 +57,11 @@ def required_wrenches(
     accelerations: Array,
     wrenches: Mapping[str, Array] | None = None,
 ) -> Array:
-    """Return the wrench (f, b, 6) that each body needs in addition to gravity and given wrenches.
+    """Return the wrench (f, b, 6) that each body needs beyond gravity and given wrenches.
 
     A wrench is the moment (N·m) above the force (N), in ground at ground's origin; it is zero for
     ground. The sum over the bodies outboard of a joint is the wrench that muscles, ligaments and
     the joint exert on them.
-
-    Args:
-        motion: poses and twists at q.
-        q: coordinates, rad and m, shape (f, n).
-        rates: first time derivatives of the coordinates, shape (f, n).
-        accelerations: second time derivatives of the coordinates, shape (f, n).
-        wrenches: given wrenches, as in `inverse_dynamics`.
     """
     twists = np.einsum("fbin,fn->fbi", motion.twists, rates)
     result = np.zeros_like(twists)
@@ -93,7 +86,7 @@ def required_wrenches(
 def _accelerations(
     kinematics: Kinematics, motion: Motion, twists: Array, q: Array, rates: Array, second: Array
 ) -> Array:
-    """Return the time derivative (f, b, 6) of each body's twist."""
+    """Return the rate (f, b, 6) of each body's twist."""
     result = np.zeros_like(twists)
     speeds, axis_accelerations = kinematics.axis_rates(q, rates, second)
     first = 0
@@ -115,7 +108,7 @@ def _accelerations(
 
 
 def _cross(twist: Array, axis: Array) -> Array:
-    """Return the cross product (f, 6) of twists, the rate of an axis that moves with a twist."""
+    """Return the rate (f, 6) of an axis that moves with a twist."""
     omega, speed = twist[:, :3], twist[:, 3:]
     linear = np.cross(omega, axis[:, 3:]) + np.cross(speed, axis[:, :3])
     return np.hstack([np.cross(omega, axis[:, :3]), linear])
@@ -136,8 +129,8 @@ class CoordinateMotion:
     Args:
         time: times, s, shape (f,).
         q: coordinates, rad and m, shape (f, n).
-        rates: first time derivatives of the coordinates, per s, shape (f, n).
-        accelerations: second time derivatives of the coordinates, per s², shape (f, n).
+        rates: first time derivatives, per s, (f, n).
+        accelerations: second time derivatives, per s², (f, n).
     """
 
     time: Array
@@ -190,7 +183,7 @@ def _column_of(name: str, recorded: Table) -> str | None:
 
 
 def _angle_scale(angles: dict[str, Array], recorded: Table) -> float:
-    """Return the factor from the angles' unit to rad, from the file's header."""
+    """Return the file's unit of angles in rad."""
     largest = max(float(np.abs(values).max()) for values in angles.values())
     worst = max(angles, key=lambda name: np.abs(angles[name]).max())
     if recorded.in_degrees is None:
@@ -211,11 +204,7 @@ def _angle_scale(angles: dict[str, Array], recorded: Table) -> float:
 
 
 def angle_lines(kinematics: Kinematics, recorded: Table, q: Array) -> tuple[str, ...]:
-    """Return a remark if the angles are too small for their stated unit.
-
-    Args:
-        q: coordinates from the table, rad and m, shape (f, n).
-    """
+    """Return a remark if the angles are too small for their stated unit."""
     coordinates = kinematics.model.coordinates
     angles = [kinematics.coordinates[name] for name in coordinates if coordinates[name].rotational]
     turns = np.ptp(q[:, angles], axis=0) / DEGREE
@@ -243,7 +232,7 @@ def coordinate_motion(
 
     Args:
         time: times of the samples, s, shape (m,).
-        q: coordinates, rad and m, shape (m, n). Values of dependent coordinates are ignored.
+        q: coordinates, rad and m, (m, n). Values of dependent coordinates are ignored.
         cutoff_Hz: cut-off frequency, Hz, as in `differentiate_coordinates`.
         at: times of the result, s, shape (f,); None: `time`.
     """

@@ -105,7 +105,6 @@ class LineSet:
         """Return lengths, moment arms, wrenches on groups of bodies, and crossings between groups.
 
         Args:
-            q: coordinates, rad and m, shape (..., n).
             groups: names of the bodies in each of the g groups.
         """
         q = self.kinematics.vector(q)
@@ -127,7 +126,7 @@ class LineSet:
         return Pulls(self.names, length, arm, wrench, StraightParts.joined(parts))
 
     def _chunks(self, q: Array) -> Iterator[tuple[int, Array]]:
-        """Yield, for each block of frames, the index of its first frame and coordinates (f, n)."""
+        """Yield, by block of frames, the index of the first one and coordinates (f, n)."""
         flat = q.reshape(-1, q.shape[-1])
         for first in range(0, len(flat), BLOCK_FRAMES):
             yield first, flat[first : first + BLOCK_FRAMES]
@@ -167,9 +166,8 @@ class LineSet:
         return lengths, arms, work
 
     def _own_motion(self, q: Array) -> tuple[Array, list[tuple[int, int, Array]]]:
-        """Return the points (f, k, 3) in their bodies, and derivatives of moving points.
-
-        A derivative is a tuple (index of the point, index of the coordinate, dp/dq (f, 3)).
+        """Return the points (f, k, 3) in their bodies, and derivatives of moving points: index of
+        the point, of the coordinate, dp/dq (f, 3).
         """
         locations = np.broadcast_to(self._locations, (len(q), *self._locations.shape)).copy()
         rates = []
@@ -186,7 +184,7 @@ class LineSet:
         return locations, rates
 
     def _followers(self, q: Array) -> Index:
-        """Return the index (f, k) of the next active point after each active point; -1: none."""
+        """Return the next active point (f, k) after each active one; -1: none."""
         follower = np.full((len(q), len(self._points)), -1)
         ends = set(self._last.tolist())
         upcoming = np.full(len(q), -1)
@@ -217,7 +215,7 @@ class LineSet:
         motion: Motion,
         work: Tension,
     ) -> None:
-        """Add strings from point k to points `next_point` in frames `rows`, over the wraps."""
+        """Add strings from point k to `next_point` in frames `rows`, over the wraps."""
         objects = self.kinematics.model.wrap_objects
         usable = [w for w in path.wraps if first + w.first <= k and objects[w.wrap_object].active]
         wraps = [objects[w.wrap_object] for w in usable]

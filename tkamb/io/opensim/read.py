@@ -2,8 +2,8 @@
 
 tkamb reads the layout of OpenSim 4 (sockets, offset frames, sets of joints), the older layout
 (joints nested in their bodies), and sets in separate files. An element that cannot be read is an
-error. A partial reading lists it in `unread` instead. Elements that tkamb does not model, such as
-contact forces, are listed in `left_out`.
+error, or in a partial reading listed in `unread`; elements that tkamb does not model, such as
+contact forces, are in `left_out`.
 """
 
 from collections.abc import Mapping
@@ -38,8 +38,9 @@ UNITS = {
 }
 """Tag of a unit -> accepted spellings of metre and newton."""
 NO_UNIT = ("unassigned", "unknown")
-"""Words for a unit that OpenSim writes when it does not know the unit. OpenSim then computes in
-metres and newtons, as always."""
+"""Words for a unit that OpenSim writes when it does not know the unit. It then computes in metres
+and newtons, as always.
+"""
 
 
 # Oldest version of a file that is read, from OpenSim 2.3.2. Older files use other names.
@@ -116,8 +117,8 @@ def read_osim(path: str | Path, partial: bool = False) -> OpenSimModel:
 def _upright(gravity: Array, notices: list[str]) -> tuple[Array, str | None]:
     """Return the rotation (3, 3) of the file's ground to one whose y points up, and its axes.
 
-    It is the smallest such rotation. The axes are those of `OpenSimModel.ground_axes`. `notices`
-    gets a line if gravity is not that of a ground with y up.
+    It is the smallest one; the axes are `OpenSimModel.ground_axes`. `notices` gets a line if
+    gravity is not along -y.
     """
     size = float(np.linalg.norm(gravity))
     if size == 0.0:
@@ -169,7 +170,7 @@ def _check_metres(document: Document, model: Element, joints: list[Joint]) -> No
 def _concerns(
     element: Element, frames: Frames, coordinates: Mapping[str, Coordinate]
 ) -> frozenset[str]:
-    """Return the names of bodies and coordinates that occur in an element."""
+    """Return the bodies and coordinates in an element."""
     texts = [part for e in element.iter() for part in ((e.text or ""), e.get("name", ""))]
     words = {word for text in texts for word in text.replace("/", " ").split()}
     named = {word for word in words if word in frames.bodies or word in coordinates}
@@ -184,7 +185,7 @@ def _concerns(
 def _opened(
     root: Element, path: Path, partial: bool, notices: list[str]
 ) -> tuple[Document, Element]:
-    """Return the document and its <Model>. `notices` gets a line for each unit without a name."""
+    """Return the document and its <Model>; `notices` gets a line for each unit without a name."""
     model = root.find("Model")
     if root.tag != "OpenSimDocument" or model is None:
         raise InputError(
@@ -231,7 +232,7 @@ def _bodies(document: Document, model: Element) -> dict[str, Body]:
 
 
 def _inertia(document: Document, element: Element) -> Array:
-    """Return the inertia (3, 3), kg·m², about the centre of mass, from an old or new file."""
+    """Return (3, 3), kg·m², about the centre of mass, from an old or new file."""
     if document.find(element, "inertia") is not None:
         xx, yy, zz, xy, xz, yz = document.numbers(element, "inertia", count=6)
     else:

@@ -29,7 +29,7 @@ STANDARD_JOINTS: dict[str, tuple[tuple[Array, ...], tuple[Array, ...]]] = {
     "GimbalJoint": ((X, Y, Z), ()),
     "FreeJoint": ((X, Y, Z), (X, Y, Z)),
 }
-"""Class of a joint -> its rotation axes and translation axes. Each axis has one coordinate."""
+"""Class of a joint -> its rotation and translation axes, with one coordinate each."""
 
 
 def offset_pose(rotation_xyz: Array, translation: Array) -> Array:
@@ -41,12 +41,11 @@ def offset_pose(rotation_xyz: Array, translation: Array) -> Array:
 class Frames:
     """Bodies and the offset frames that are fixed to them.
 
-    Several joints may have frames of the same name with different values. Frames are therefore
-    stored by owner and name.
+    They are stored by owner and name, because several joints may have frames of one name.
 
     Args:
         offsets: (owner, frame) -> the frame's parent, and the frame's pose (4, 4) in the parent.
-        unread: name of a frame -> reason for which it could not be read.
+        unread: frame -> reason for which it could not be read.
         upright: pose (4, 4) of the file's ground in a ground whose y points up.
     """
 
@@ -60,7 +59,7 @@ class Frames:
     def of(
         cls, document: Document, model: Element, bodies: Iterable[str], upright: Array
     ) -> "Frames":
-        """Return the frames of a model. `upright` turns the file's ground, shape (3, 3)."""
+        """Return the frames of a model, with the rotation `upright` (3, 3) of its ground."""
         offsets: dict[tuple[str, str], tuple[str, Array]] = {}
         stations = _stations(document, model)
         unread: dict[str, str] = {}
@@ -107,7 +106,7 @@ class Frames:
         raise InputError(f"names a frame '{socket}' that does not exist", self.document.where(user))
 
     def point(self, user: Element, socket: str, location: Array) -> tuple[str, Array]:
-        """Convert a point (3,), m, of a socket's frame to its body. Return body and point."""
+        """Return body and point (3,), m, of a point of a socket's frame."""
         body, in_body = self.resolve(user, socket)
         return body, transform(in_body, location)
 
@@ -190,7 +189,7 @@ def read_joints(
 def _joint(
     document: Document, element: Element, frames: Frames, child: str | None
 ) -> tuple[Joint, dict[str, Coordinate]]:
-    """Return a joint and its coordinates. A partial reading welds a joint of unreadable motion."""
+    """A partial reading welds a joint of unreadable motion."""
     (parent, in_parent), (body, in_child) = _joint_frames(document, element, frames, child)
     entries = [*document.objects(element, "CoordinateSet"), *element.findall("coordinates/*")]
     names = [document.name(entry) for entry in entries]
@@ -225,7 +224,7 @@ def _joint_elements(document: Document, model: Element) -> Iterator[tuple[Elemen
 def _joint_frames(
     document: Document, element: Element, frames: Frames, child: str | None
 ) -> tuple[tuple[str, Array], tuple[str, Array]]:
-    """Return, for parent and child, the body and the pose (4, 4) of the joint's frame in it."""
+    """Return body, and pose (4, 4) of the joint's frame in it, of parent and child."""
     if child is None:
         name = document.name(element)
         sockets = (document.socket(element, f"{end}_frame") for end in ("parent", "child"))
@@ -280,10 +279,10 @@ def _custom_axes(
 def _named_axes(
     document: Document, joint: Element, spatial_transform: Element
 ) -> list[tuple[str, Element]]:
-    """Return the names and elements of a joint's axes, in the order in which they act.
+    """Return a joint's axes in the order in which they act.
 
-    As in OpenSim, the name of an axis decides its place, not its position in the file. Axes without
-    any name are in the order of `AXES`.
+    As in OpenSim, an axis' name decides its place, not its position in the file; axes without any
+    are in the order of `AXES`.
     """
     entries: dict[str, Element] = {}
     found: list[tuple[str, Element]] = []
@@ -336,7 +335,7 @@ def _coordinate(
 
 
 def _is_angle_of(axis: JointAxis, coordinate: str) -> bool:
-    """Return whether the angle about an axis equals a coordinate, apart from sign and offset."""
+    """Return whether an angle equals a coordinate, apart from sign and offset."""
     function = axis.function
     straight = isinstance(function, Linear) and abs(function.gradient) == 1.0
     return axis.coordinate == coordinate and straight
@@ -345,8 +344,8 @@ def _is_angle_of(axis: JointAxis, coordinate: str) -> bool:
 def outwards(document: Document, joints: list[Joint], bodies: Iterable[str]) -> tuple[Joint, ...]:
     """Return the joints in order from ground outwards, with `backwards` set.
 
-    A partial reading leaves out a joint that closes a loop. If no chain of joints connects a body
-    with ground, it welds the body to ground and marks the weld as unread.
+    A partial reading leaves out a joint that closes a loop, and welds to ground, as unread, a body
+    that no chain of joints connects with it.
     """
     path = document.path
     reached, waiting, ordered = {GROUND}, list(joints), []
@@ -378,7 +377,7 @@ def outwards(document: Document, joints: list[Joint], bodies: Iterable[str]) -> 
 def _hold_still(
     document: Document, body: str, reason: str, ordered: list[Joint], hint: str | None = None
 ) -> None:
-    """Weld a body to ground and record the reason. This is an error unless `partial`."""
+    """Weld a body to ground and record the reason, an error unless `partial`."""
     weld = Element("WeldJoint", {"name": f"{body} held still"})
     weld.text = body
     with document.reading(weld):

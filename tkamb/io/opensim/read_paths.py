@@ -35,7 +35,7 @@ MUSCLES = (
     "DeGrooteFregly2016Muscle",
     "RigidTendonMuscle",
 )
-"""Supported classes of muscles. They share the parameters that tkamb reads."""
+"""Supported classes of muscles, which share the parameters that tkamb reads."""
 
 SHAPES: dict[str, tuple[Shape, tuple[str, ...]]] = {
     "WrapCylinder": ("cylinder", ("radius", "length")),
@@ -48,7 +48,7 @@ METHODS = ("hybrid", "midpoint", "axial")
 
 
 def read_wrap_objects(document: Document, model: Element, frames: Frames) -> dict[str, WrapObject]:
-    """Return name -> wrap object, of all bodies. The first of equal names counts, as in OpenSim."""
+    """Return name -> wrap object; the first of equal names counts, as in OpenSim."""
     result: dict[str, WrapObject] = {}
     ground = [] if (element := model.find("Ground")) is None else [element]
     for body in (*ground, *document.objects(model, "BodySet")):

@@ -1,11 +1,10 @@
 """C3D recordings: markers, force plates and other analog channels, in SI, with gaps as NaN.
 
-Frame k of the file is at the time (first frame + k)/rate. The first frame is counted from zero, so
-that a trial cut out of a longer one keeps its times. A marker with a negative residual, or at
-exactly (0, 0, 0), is missing in that frame: a gap.
+Frame k of the file is at the time (first frame + k)/rate, the first one counted from zero, so that
+a trial cut out of a longer one keeps its times. A marker with a negative residual, or at exactly
+(0, 0, 0), is missing in that frame: a gap.
 
-Markers, channels and each plate are read separately. An error in one part is stored, and raised
-only when that part is used.
+An error in markers, channels or one plate is raised only when that part is used.
 
 Format: C3D user guide, https://www.c3d.org.
 """
@@ -48,12 +47,10 @@ class Recording:
             None.
         residual: (n, m) m, residual of the markers' reconstruction; NaN in gaps.
         length_unit: "m"; None if the file's word for the unit is unknown.
-        analog_rate_Hz: samples per second of the channels.
         channels: name -> (k,) samples of each channel that belongs to no plate, like EMG.
         channel_units: name -> unit, as in the file.
         plates: the readable force plates, in the file's order.
         faults: name of an unreadable part ("markers", "channels", "plate 2") -> its error.
-        length_word: the file's word for its unit of length.
     """
 
     path: Path
@@ -221,7 +218,7 @@ class _Reader:
         return labels, sorted(name for name, n in Counter(labels).items() if n > 1)
 
     def _metres_per_unit(self) -> float | None:
-        """Return metres per unit of length; None if the file's word is unknown."""
+        """Return None if the file's word for its unit is unknown."""
         words = self._parameters.texts("POINT:UNITS")
         word = words[0] if words else ""
         scale, unit = metres(word), self.units.length
@@ -236,7 +233,7 @@ class _Reader:
         return metres(unit)
 
     def _analog(self, rate: float) -> tuple[float, list[str], Array, list[str]]:
-        """Return the rate (Hz), names, samples (c, k) and units of the analog channels."""
+        """Return rate (Hz), names, samples (c, k) and units of the channels."""
         header, parameters = self.file.header, self._parameters
         samples = header.samples or 1
         count = self.file.raw_analog.shape[1]
@@ -285,7 +282,7 @@ class _Reader:
         return tuple(plates)
 
     def _unused_parameters(self) -> Iterator[str]:
-        """Yield a remark on each parameter of the plates with numbers that are not understood."""
+        """Yield a remark on each plate parameter with numbers that are not understood."""
         group = "FORCE_PLATFORM:"
         names = {*self._parameters.values, *self._parameters.damaged}
         for name in sorted(name for name in names if name.startswith(group)):
@@ -350,10 +347,10 @@ class _Reader:
         )
 
     def _per_plate(self, key: str, rows: tuple[int, ...] | None) -> Array | None:
-        """Return a parameter's numbers, in the shape `rows` per plate; the last index is the plate.
+        """Return the numbers in the shape `rows` per plate, which is the last index; the file may
+        lack it for one plate.
 
-        The file may lack the last index if it has one plate. None: the parameter is missing, or its
-        size does not fit.
+        None: the parameter is missing or of another size.
         """
         value = self._parameters.numbers(f"FORCE_PLATFORM:{key}")
         if value is None or not value.size:
@@ -364,7 +361,7 @@ class _Reader:
         return value.reshape((*shape, -1), order="F")
 
     def _calibration(self, kind: int, k: int) -> Array | None:
-        """Return the calibration matrix (6, c) of plate k, a column per channel, or None."""
+        """Return the calibration matrix (6, c) of plate k, or None."""
         value = self._parameters.numbers("FORCE_PLATFORM:CAL_MATRIX")
         if kind not in (4, 5) or value is None or value.ndim < 2:
             return None
@@ -378,10 +375,10 @@ class _Reader:
         return matrix if matrix.any() else None
 
     def _zero(self) -> slice | None:
-        """Return the samples that FORCE_PLATFORM:ZERO states as unloaded; None if it states none.
+        """Return the samples that FORCE_PLATFORM:ZERO states as unloaded, or None.
 
-        ZERO holds two frame numbers. In a recording cut out of a longer one, they are numbers of
-        the longer one if both lie within the recording. Otherwise they count from its first frame.
+        Its two frame numbers are those of a longer recording, of which this one is a part, if both
+        lie within this one; otherwise they count from its first frame.
         """
         frames = self._parameters.integers("FORCE_PLATFORM:ZERO")
         if len(frames) != 2 or frames[1] < 1 or frames[1] < frames[0]:
@@ -397,7 +394,7 @@ class _Reader:
 
 
 def no_length_unit(word: str, path: Path) -> InputError:
-    """Return the error for a recording with an unknown unit of length."""
+    """Return the error for an unknown unit of length."""
     stated = f"the unit '{word}'" if word else "no unit"
     return InputError(
         f"states {stated} for its markers (POINT:UNITS)",

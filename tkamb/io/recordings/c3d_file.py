@@ -1,7 +1,6 @@
 """The content of a C3D file: header, parameters, and the numbers of its frames.
 
-Every read is checked against the size of the file, so that a damaged file gives one message.
-`tkamb.io.recordings.c3d` interprets the numbers as markers, channels and force plates.
+Every read is checked against the file's size, so that a damaged file gives one message.
 
 A file begins with a header of 512 bytes. Its parameter section is a chain of records: a group,
 or a parameter with type, dimensions and values. Its data section holds frame after frame: four
@@ -25,10 +24,9 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 
 BLOCK = 512
-"""Bytes of a block. The format counts positions in blocks."""
+"""Bytes of a block, in which the format counts positions."""
 LARGEST_16_BIT = 65535
-"""Largest frame number that the header can hold. Longer recordings state theirs in
-TRIAL."""
+"""Largest frame number of the header; longer recordings state theirs in TRIAL."""
 EXPORT = "export the trial again as C3D"
 MOST_DIMENSIONS = 7
 """Largest number of dimensions of a parameter, by the format."""
@@ -82,7 +80,7 @@ class Parameters:
     damaged: set[str] = field(default_factory=set)
 
     def get(self, name: str) -> Any:
-        """Return the values of "GROUP:NAME"; None if the file has no such parameter."""
+        """Return the values of "GROUP:NAME"; None without such a parameter."""
         if name in self.damaged:
             raise InputError(f"has a damaged parameter {name}", self.path, EXPORT)
         return self.values.get(name)
@@ -129,7 +127,6 @@ class C3dFile:
     """The content of a file.
 
     Args:
-        parameters: the parameters of all groups.
         first_frame: number of the first frame, counted from zero.
         points: (n, m, 3) in the file's length unit, gaps NaN.
         residual: (n, m) in the file's length unit; NaN in gaps.
@@ -176,7 +173,7 @@ def _header(content: bytes, machine: int) -> Header:
 def _floats(content: bytes, machine: int) -> Array:
     """Return 32-bit floats of a machine.
 
-    DEC floats have their 16-bit halves exchanged and an exponent that is larger by two.
+    DEC floats have exchanged 16-bit halves and an exponent larger by two.
     """
     if machine != _DEC:
         kind = ">f4" if machine == _MIPS else "<f4"
@@ -191,7 +188,6 @@ def _parameters(
     """Return "GROUP:NAME" -> values, and the names of the damaged parameters.
 
     Args:
-        content: bytes of the file.
         position: first byte of the chain of records.
         end: largest possible end of the chain, byte.
     """
@@ -260,10 +256,9 @@ def _value(record: bytes, machine: int) -> Any:
 def _agreed_header(
     content: bytes, header: Header, parameters: Parameters, machine: int, path: Path
 ) -> tuple[Header, list[str]]:
-    """Return the header whose layout fits the file, and a notice if parameters contradict it.
+    """Return the header whose layout fits the file, and a notice on a contradiction.
 
-    If header and parameters contradict each other, the frames of exactly one of their layouts must
-    end within the last block of the file.
+    The frames of exactly one of the layouts must then end within the file's last block.
     """
     error = _disagreement(header, parameters, path)
     if error is None:
@@ -285,7 +280,7 @@ def _agreed_header(
 
 
 def _layouts(header: Header, parameters: Parameters) -> Iterator[Header]:
-    """Yield the headers of all layouts that header and parameters state between them.
+    """Yield the headers of all layouts that header and parameters state.
 
     Some programs write the number of channels as the number of analog values per frame.
     """
@@ -305,7 +300,7 @@ def _layouts(header: Header, parameters: Parameters) -> Iterator[Header]:
 
 
 def _disagreement(header: Header, parameters: Parameters, path: Path) -> InputError | None:
-    """Return how header and parameters contradict each other on the layout of the data, or None."""
+    """Return how header and parameters contradict each other, or None."""
     used = parameters.integers("POINT:USED")
     if used and used[0] != header.markers:
         return InputError(
@@ -394,10 +389,8 @@ class _Data:
         )
 
     def _start(self, notices: list[str]) -> int:
-        """Return the first byte of the data.
-
-        Header and POINT:DATA_START both state the first block of the data. If they differ, the
-        frames must fit the size of the file from exactly one of the two blocks.
+        """Header and POINT:DATA_START both state the first block of the data; if they differ, the
+        frames must fit the file from exactly one of the two.
         """
         stated = self.parameters.integers("POINT:DATA_START")
         blocks = list(dict.fromkeys([self.header.data_block, *stated[:1]]))
@@ -431,9 +424,7 @@ class _Data:
         return max(first - 1, 0)
 
     def _stated(self) -> int:
-        """Return the number of frames that the file states.
-
-        The header's frame numbers have 16 bits. Longer recordings state the number in the two
+        """The header's frame numbers have 16 bits; longer recordings state the number in the two
         words of TRIAL, or else in POINT:LONG_FRAMES or POINT:FRAMES.
         """
         wrap = LARGEST_16_BIT + 1
@@ -453,7 +444,7 @@ class _Data:
         return header
 
     def _count(self, stored: int, notices: list[str]) -> int:
-        """Return the number of frames to read; the file has room for `stored` frames."""
+        """Return the number of frames to read, of at most `stored` ones."""
         stated = self._stated()
         other = self.parameters.integers("POINT:FRAMES")
         spare = math.ceil(BLOCK / self._frame)
@@ -491,8 +482,8 @@ class _Data:
     def _points(self, words: Array) -> tuple[Array, Array]:
         """Return positions (n, m, 3) and residuals (n, m) in the file's unit, gaps NaN.
 
-        The fourth word of a marker holds the cameras in its high byte and the residual, in units
-        of the scale, in its low byte. It is negative if the marker is missing.
+        A marker's fourth word has the cameras in its high byte and the residual, in units of the
+        scale, in its low byte; it is negative if the marker is missing.
         """
         scale = abs(self.header.scale)
         positions = words[:, :, :3] * (1.0 if self._word == 4 else scale)

@@ -90,7 +90,7 @@ def find_gait(time: Array, vertical: Array) -> Gait:
 
 
 def cycle_percent(time: Array, cycle: tuple[float, float]) -> Array:
-    """Return per cent of a cycle (...,) at times (...,) s; NaN outside the cycle."""
+    """Return per cent of a cycle (...,) at times (...,), s; NaN outside."""
     start, end = cycle
     percent = 100.0 * (time - start) / (end - start)
     return np.where((percent >= 0.0) & (percent <= 100.0), percent, np.nan)
@@ -115,8 +115,7 @@ class Cycle:
     """A motion over per cent of a gait cycle, assigned to an interval of time.
 
     Args:
-        start: start of the interval, s.
-        period: length of the interval, s.
+        start: start of the interval of length `period`, s.
         offset_percent: per cent of the cycle at `start`.
         closed: whether 0 and 100 % were recorded and agree.
     """

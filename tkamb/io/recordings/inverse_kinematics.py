@@ -6,8 +6,8 @@ markers x_m(q),
     min_q  sum_m w_m |x_m(q) - p_m|²
 
 is solved by Gauss-Newton steps with Levenberg's damping and analytic Jacobians. Near the solution
-Newton's method is used if the chain gives the curvature of the residuals. Frames are independent
-and solved all at once: every array has the frames as its first axis. No bounds are imposed, so
+Newton's method is used if the chain gives the curvature of the residuals. All frames are
+independent and solved at once: every array has them as its first axis. No bounds are imposed, so
 that a coordinate outside its range is visible.
 
 Reference: Lu & O'Connor, J Biomech 32:129 (1999), doi:10.1016/S0021-9290(98)00158-4.
@@ -62,7 +62,7 @@ class NormalEquations:
         )
 
     def replaced(self, frames: Index, part: "NormalEquations") -> "NormalEquations":
-        """Return the equations with those of some frames replaced by `part`."""
+        """Return the equations with some frames replaced by `part`."""
         return NormalEquations(
             put(self.cost, frames, part.cost),
             put(self.matrix, frames, part.matrix),
@@ -74,10 +74,10 @@ class NormalEquations:
 
 
 class MarkerChain(Protocol[State]):
-    """A chain with n degrees of freedom and m markers, to be fitted to measured markers."""
+    """A chain with n degrees of freedom and m markers."""
 
     def places(self, state: State) -> Array:
-        """Return the positions (f, m, 3) m of the chain's markers."""
+        """Return the chain's marker positions (f, m, 3), m."""
 
     def normal(self, state: State, target: Array, weights: Array) -> NormalEquations:
         """Return the normal equations for measured markers (f, m, 3) m with weights (f, m)."""
@@ -116,7 +116,6 @@ def fit_chain(
 
     Args:
         measured: (f, m, 3) m, gaps NaN.
-        weights: (m,) weights of the squared distances.
     """
     visible = np.isfinite(measured).all(axis=2)
     target, frame_weights = np.nan_to_num(measured), np.where(visible, weights, 0.0)
@@ -158,7 +157,7 @@ def fit_chain(
 def _step(equations: NormalEquations, damping: Array, near: NDArray[np.bool_]) -> Array:
     """Return the damped steps (f, n): Newton's where `near` (f,), else Gauss-Newton's.
 
-    A Newton step that does not reduce the cost is replaced by a Gauss-Newton step.
+    A Newton step that does not reduce the cost is replaced.
     """
     matrix, right = equations.matrix, equations.right
     diagonal = np.einsum("fii->fi", matrix)
@@ -175,7 +174,7 @@ def _step(equations: NormalEquations, damping: Array, near: NDArray[np.bool_]) -
 
 
 def put(values: Array, frames: Index, part: Array) -> Array:
-    """Return a copy of `values` with those of some frames replaced by `part`."""
+    """Return a copy with the values of some frames replaced by `part`."""
     result = values.copy()
     result[frames] = part
     return result
@@ -201,7 +200,6 @@ class Segment:
 
     Args:
         name: "shank", "thigh", or the name of a neighbouring segment.
-        labels: (m) labels of its markers.
         points: (m, 3) m, its markers in its frame.
         weights: (m,) weights of the markers' squared distances.
         joined_to: of a neighbour: the segment, "shank" or "thigh", to which a ball joint connects
@@ -221,7 +219,7 @@ class Segment:
 
 @dataclass(frozen=True, eq=False)
 class LegState:
-    """Poses of the segments of a leg.
+    """Poses of a leg's segments.
 
     Args:
         shank: (f, 4, 4) pose_shank_in_world.
@@ -327,7 +325,7 @@ class LegChain:
         return np.concatenate(places, axis=1), np.concatenate(blocks, axis=1)
 
     def _add_knee(self, block: Array, x: Array, name: str, state: LegState) -> None:
-        """Add the columns of shank and knee to the Jacobian of the markers x (f, m, 3)."""
+        """Add the columns of shank and knee to the Jacobian of x (f, m, 3)."""
         if name == "thigh" and self.free:
             block[..., 6:9] = np.eye(3)
             block[..., 9:12] = -skew(x - state.thigh[:, None, :3, 3])

@@ -1,7 +1,7 @@
 """Unit words of recordings, and columns in the laboratory (x forward, y up, z right) in SI.
 
-Case, blanks, dots, hyphens and asterisks are ignored. Only the listed words are units. For another
-word, a reader raises an error when it needs the quantity. No unit is guessed.
+Case, blanks, dots, hyphens and asterisks are ignored, and only the listed words are units: no unit
+is guessed, and a reader that needs the quantity raises an error.
 """
 
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ LENGTH_WORDS = {
     **dict.fromkeys(("in", "inch", "inches"), LENGTH["inch"]),
     **dict.fromkeys(("ft", "foot", "feet"), 12 * LENGTH["inch"]),
 }
-"""Metres per unit. Some programs shorten a word to four letters."""
+"""Metres per unit; some programs shorten a word to four letters."""
 FORCE_WORDS = {
     **dict.fromkeys(("n", "nt", "newt", "newton", "newtons"), 1.0),
     **dict.fromkeys(("dan", "decanewton", "decanewtons"), 10.0),
@@ -40,14 +40,14 @@ FORCE_WORDS = {
 }
 """Newtons per unit."""
 LENGTH_FIRST = ("in", "inch", "ft", "foot")
-"""Units of length that may precede the force, as in `in-lb`. `mN` is a millinewton."""
+"""Units of length that may precede the force, as in `in-lb`, while `mN` is a millinewton."""
 
 _SEPARATORS = str.maketrans("", "", " .*-·⋅_\x00\t")
 
 
 @dataclass(frozen=True)
 class GivenUnits:
-    """Units that the user states. None: the unit that the recording states.
+    """Units that the user states; None: those of the recording.
 
     Args:
         length: unit of markers and plates, like mm.
@@ -78,7 +78,7 @@ def newtons(word: str) -> float | None:
 def newton_metres(word: str) -> float | None:
     """Return newton metres per unit of moment; None for a word that is not a unit.
 
-    A unit of moment is a unit of force, then one of length. Inches and feet may also come first.
+    It is a unit of force, then one of length, or inches or feet first.
     """
     plain = plain_unit(word)
     for first in LENGTH_FIRST:

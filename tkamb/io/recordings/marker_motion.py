@@ -1,6 +1,6 @@
 """Motion of knee and shank from skin markers, by separate rigid fits and by a chain.
 
-The same markers are fitted in two ways. Both fits are computed, and the scene chooses one:
+Both fits are computed, and the scene chooses one:
 
 - segments: shank and thigh are fitted rigidly and separately. Each segment gives a knee
   centre. The distance between the two centres shows the movement of the skin.
@@ -50,7 +50,7 @@ MAX_JOINT_GAP = 0.1
 
 @dataclass(frozen=True, eq=False)
 class MarkerKinematics:
-    """Kinematics of a leg from skin markers, SI. A left leg is mirrored to a right one.
+    """Kinematics of a leg from skin markers, SI; a left leg is mirrored to a right one.
 
     Args:
         time: (n,) s, times of the frames that `method` can fit, without a gap.
@@ -93,7 +93,6 @@ def load_marker_motion(
     """Return the kinematics of knee and shank from the markers of a recording.
 
     Args:
-        source: the scene's [motion], with markers.
         side: side of the knee; a left leg and its laboratory are mirrored.
         pose_insert_in_tibia: (4, 4) m, pose in the patient's URDF, mirrored for a left knee.
     """
@@ -149,7 +148,7 @@ def leg_segments(
 ) -> tuple[list[Segment], dict[str, Array]]:
     """Return the segments, and segment -> measured markers (n, m, 3) m, gaps NaN.
 
-    The markers are in the laboratory's axes; those of a left leg are mirrored.
+    They are in the laboratory's axes, those of a left leg mirrored.
     """
     scale = recorded.unit_scale(length_unit, "length_unit")
     rotation = laboratory_rotation(markers.laboratory_axes, recorded.path)
@@ -251,14 +250,14 @@ def _compare_readings(
 
 
 def _joint_rms(fits: dict[str, tuple[Array, Array]], measured: dict[str, Array]) -> Array:
-    """Return the root mean square distance (n,) of shank and thigh markers together."""
+    """Return the root mean square distance (n,) over shank and thigh markers."""
     counts = [np.isfinite(measured[name]).all(axis=2).sum(axis=1) for name in KNEE_SEGMENTS]
     squares = [fits[name][1] ** 2 * k for name, k in zip(KNEE_SEGMENTS, counts, strict=True)]
     return np.asarray(np.sqrt(np.sum(squares, axis=0) / np.maximum(np.sum(counts, axis=0), 1)))
 
 
 def _knee(insert: Array, femur: Array) -> Array:
-    """Return knee coordinates (n, 6) from poses (n, 4, 4); NaN where a pose is NaN."""
+    """Return knee coordinates (n, 6) from poses (n, 4, 4)."""
     finite = np.isfinite(insert[:, 0, 3]) & np.isfinite(femur[:, 0, 3])
     result = np.full((len(insert), 6), np.nan)
     if finite.any():

@@ -28,8 +28,8 @@ def plain_label(label: str) -> str:
 def matched_labels(names: Iterable[str], labels: Iterable[str]) -> dict[str, str]:
     """Return name -> label in the recording, for each name with a match.
 
-    A name matches an equal label, or else the only label with the same `plain_label`. There is no
-    match if several labels have the same `plain_label` (two subjects).
+    A name matches an equal label, or else the only label with the same `plain_label` (not of two
+    subjects).
     """
     labels = list(labels)
     plain: dict[str, list[str]] = {}
@@ -60,7 +60,7 @@ def marker_trajectories(table: Table, names: list[str], metres_per_unit: float) 
 def shank_points(source: TibiaTable, recorded: Table) -> tuple[Array, Array]:
     """Return the shank's markers and joint centres, as measured and in the tibia link's frame.
 
-    A joint centre is found by a rigid fit of the neighbouring segment's markers.
+    A joint centre is by a rigid fit of the neighbouring segment's markers.
 
     Returns:
         Points (n, m, 3), m, in the file's axes, gaps NaN; reference points (m, 3), m.
@@ -119,10 +119,9 @@ def fit_rigid(points: Array, reference: Array, name: str = "the tibia") -> tuple
 
 
 def fit_seen(points: Array, reference: Array, weights: Array, name: str) -> tuple[Array, Array]:
-    """Return the weighted rigid fit of the visible markers, frame by frame.
+    """Return the weighted rigid fit of the visible markers, which may have gaps.
 
-    Unlike `fit_rigid`, it accepts weights and gaps. A frame is NaN unless three visible markers
-    span a triangle.
+    A frame is NaN unless three of them span a triangle.
 
     Args:
         points: (n, m, 3) m, gaps NaN.
@@ -162,7 +161,7 @@ def _spans(reference: Array) -> bool:
 
 
 def _nearest_rotation(h: Array) -> Array:
-    """Return the rotations (n, 3, 3) of Kabsch's covariances (n, 3, 3); see `fit_rigid`."""
+    """Return Kabsch's rotations (n, 3, 3) of covariances (n, 3, 3); see `fit_rigid`."""
     u, _, vt = np.linalg.svd(h)
     v, ut = np.swapaxes(vt, 1, 2), np.swapaxes(u, 1, 2)
     signs = np.ones((len(h), 3))
@@ -187,10 +186,7 @@ def complete_run(
 
     Args:
         points: (n, m, 3), gaps NaN.
-        names: names of the m markers, for the message.
-        time: (n,) s.
-        start: start of the interval, s.
-        end: end of the interval, s.
+        start: start of the interval, s, which lasts to `end`.
     """
     first = int(np.searchsorted(time, start + 1e-9, side="right")) - 1
     last = int(np.searchsorted(time, end - 1e-9, side="left"))

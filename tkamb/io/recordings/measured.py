@@ -1,14 +1,14 @@
 """Measured forces of an instrumented implant, and envelopes of surface EMG.
 
-An envelope is the signal high-passed, rectified, low-passed and divided by a normalising value.
-Both filters are Butterworth filters of second order that run forwards and backwards. They shift no
-phase and halve the amplitude at the cut-off. With the sampling interval h the low-pass multiplies
-each frequency f by
+An envelope is the signal high-passed, rectified, low-passed and divided by a normalising value;
+negative values are zero. Both filters are second-order Butterworth filters run forwards and
+backwards, which shift no phase and halve the amplitude at the cut-off. With the sampling interval h
+the low-pass multiplies each frequency f by
 
     1 / (1 + r⁴),  r = tan(pi f h) / tan(pi f_c h),
 
 and the high-pass by r⁴ / (1 + r⁴). The signal is mirrored at its ends, so that the low-pass also
-averages at the ends. Negative values of the envelope are set to zero.
+averages at the ends.
 
 Reference: Winter, Biomechanics and Motor Control of Human Movement, 4th ed., 2009, ch. 10.
 """
@@ -67,7 +67,6 @@ def load_measured_force(source: MeasuredTable, time: Array) -> MeasuredForce:
     """Read the measured forces.
 
     Args:
-        source: the scene's [measured].
         time: (f,) s, times of the motion, which must overlap with the measurement.
     """
     table = read_table(source.file, source.format)
@@ -91,7 +90,7 @@ def _sum(table: Table, column: str | dict[str, float]) -> Array:
 
 
 def _with_third(force: dict[str, Array]) -> dict[str, Array]:
-    """Return the forces with the third added if two are known, from total = medial + lateral."""
+    """Add the third force if two are known, from total = medial + lateral."""
     if set(force) == {"medial", "lateral"}:
         return {"total": force["medial"] + force["lateral"], **force}
     for side, other in (("medial", "lateral"), ("lateral", "medial")):
@@ -139,7 +138,6 @@ def load_envelopes(source: EmgTable, motion: Array) -> Envelopes:
     """Read EMG and return its envelopes.
 
     Args:
-        source: the scene's [muscles.emg].
         motion: (f,) s, times of the motion, which must overlap with the recording.
     """
     time, signals, remarks = _signals(source)
@@ -196,9 +194,10 @@ def envelope(
 
 
 def _low_passed(signal: Array, cutoff: float) -> Array:
-    """Return a signal (n,) after the low-pass, computed from its spectrum.
+    """Return a signal (n,) after the low-pass, from its spectrum; `cutoff` is in periods per
+    sample.
 
-    `cutoff` is in periods per sample. scipy.signal is not used: its import takes 0.3 s.
+    The import of scipy.signal takes 0.3 s.
     """
     mirrored = np.concatenate([signal, signal[-2:0:-1]])
     ratio = np.tan(np.pi * np.fft.rfftfreq(len(mirrored))) / np.tan(np.pi * cutoff)
@@ -207,7 +206,7 @@ def _low_passed(signal: Array, cutoff: float) -> Array:
 
 
 def _signals(source: EmgTable) -> tuple[Array, dict[str, Array], tuple[str, ...]]:
-    """Return times (n,) s on the file's clock, channel -> (n,), and notices on the file."""
+    """Return times (n,) s on the file's clock, channel -> (n,), and notices."""
     if source.file.suffix.lower() != ".c3d":
         table = read_table(source.file)
         time = table.time(source.time)

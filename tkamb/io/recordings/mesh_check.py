@@ -59,7 +59,7 @@ class Part:
     closed: bool
 
     def line(self) -> str:
-        """Return a line with size and centre, in file units."""
+        """Return size and centre, in file units."""
         size = " × ".join(f"{extent:.4g}" for extent in self.extents)
         where = ", ".join(f"{value:.4g}" for value in self.centre)
         state = "closed" if self.closed else "open"
@@ -68,7 +68,7 @@ class Part:
 
 @dataclass(frozen=True)
 class MeshHealth:
-    """Content of a mesh file. Lengths are in the file's units.
+    """Content of a mesh file, lengths in its units.
 
     Args:
         extents: lengths along the mesh's x, y and z.
@@ -108,7 +108,7 @@ class MeshHealth:
         return asdict(self)
 
     def lines(self) -> list[str]:
-        """Return the lines of the report. Guesses are written as questions."""
+        """Return the report, with guesses as questions."""
         size = " × ".join(f"{extent:.4g}" for extent in self.extents)
         return [
             f"{self.file}",
@@ -222,7 +222,7 @@ def _roughness(mended: Repair, units: list[str]) -> tuple[str, ...]:
 
 
 def mended_mesh(path: str | Path) -> tuple[Repair, float]:
-    """Return the repaired mesh, in m, and the guessed metres per unit of the file."""
+    """Return the repaired mesh, m, and the guessed metres per unit."""
     vertices, faces = read_triangles(path)
     scale = _measure(vertices, faces)[2]
     return repair(vertices * scale, faces), scale

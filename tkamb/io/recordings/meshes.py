@@ -233,8 +233,8 @@ def _read_by_trimesh(path: Path) -> tuple[Array, Indices]:
 def plausible_units(extent: float, size: tuple[float, float] = IMPLANT_SIZE) -> list[str]:
     """Return the units in which the largest extent (file units) is within `size` (m).
 
-    A unit that makes a part of an implant too small is left out if another unit gives a usual size.
-    Example: a knee in inches, read as centimetres, is 30 mm wide.
+    One that makes a part too small is left out if another unit gives a usual size. Example: a knee
+    in inches, read as centimetres, is 30 mm wide.
     """
     lengths = {unit: extent * metres for unit, metres in LENGTH.items()}
     fits = [unit for unit, length in lengths.items() if size[0] <= length <= size[1]]
@@ -245,12 +245,12 @@ def plausible_units(extent: float, size: tuple[float, float] = IMPLANT_SIZE) -> 
 
 
 def body_size(body: Body, unit: float) -> str:
-    """Return the extents of a body along the mesh's axes, as text. `unit` is metres per unit."""
+    """Return the extents of a body, as text; `unit` is metres per unit."""
     return " × ".join(f"{extent / unit:.3g}" for extent in body.extents)
 
 
 def describe_holes(holes: tuple[BoundaryLoop, ...], unit: str) -> str:
-    """Return a text on the widest hole, its centre in file axes and units, and the other holes."""
+    """Return a text on the widest hole, its centre in file axes and units, and the others."""
     widest, more = holes[0], len(holes) - 1
     where = ", ".join(f"{value / LENGTH[unit]:.4g}" for value in widest.centre)
     text = (
@@ -274,11 +274,10 @@ def _opposite(names: list[str]) -> str:
 def _check_stacked(
     mended: Repair, wall: InnerWall, path: str | Path, name: str, up: Array, unit: str
 ) -> None:
-    """Raise an InputError if a part consists of bodies that lie on each other, like a tray.
+    """Raise an InputError if bodies of a part lie on each other, like a tray.
 
     Args:
         up: (3,) superior direction in the file's axes.
-        unit: unit of the file.
     """
     surface = Surface(mended.vertices, mended.faces, name, merged=True)
     level = 0.5 * float(surface.areas[wall.faces] @ np.abs(surface.face_normals[wall.faces] @ up))
@@ -298,7 +297,7 @@ def _check_stacked(
 def _without_inner_wall(
     mended: Repair, wall: InnerWall, unit: str
 ) -> tuple[Repair, InnerWall | None]:
-    """Return the part without its inner wall, or the part and a wall that cannot be removed."""
+    """Return the part without its inner wall, or with one that cannot be removed."""
     where = ", ".join(f"{round(value / LENGTH[unit], 2) + 0.0:g}" for value in wall.centre)
     words = f"inner wall of {1e6 * wall.area:.0f} mm² at ({where}) {unit} between touching bodies"
     if wall.without is None:
@@ -313,7 +312,7 @@ def _check_part(
 ) -> None:
     """Raise an InputError if a part is an open sheet, like a contact surface, or several bodies.
 
-    Bodies that touch or overlap at an inner wall count as one.
+    Bodies that touch at an inner wall count as one.
     """
     extent = float(np.ptp(mended.vertices, axis=0).max())
     if mended.holes and mended.holes[0].width > SHEET_OPENING * extent:
@@ -343,10 +342,11 @@ def _check_part(
 
 
 def _two_condyles(bodies: list[Body], right: Array) -> bool:
-    """Return whether there are two bodies of similar size, side by side along `right` (3,).
+    """Return whether two bodies of similar size lie side by side along `right` (3,), as the
+    components of a bicompartmental knee.
 
-    These are the two components of a bicompartmental knee. A tray and an insert lie one above
-    the other, and parts of both legs are farther apart than their widths.
+    A tray and an insert lie one above the other, and parts of both legs are farther apart than
+    their widths.
     """
     if len(bodies) != 2:
         return False
@@ -391,7 +391,7 @@ def _check_knee_width(surface: Surface, path: str | Path) -> None:
 
 
 def _check_rounding(corners: Array, unit: str, path: str | Path, name: str) -> None:
-    """Warn, or raise an InputError, if coordinates (n, 3) are rounded too coarsely."""
+    """Warn or raise for coordinates (n, 3) that are rounded too coarsely."""
     rounding = coordinate_rounding(corners) * LENGTH[unit]
     if rounding <= ROUNDING_NOTICE:
         return
@@ -408,16 +408,15 @@ def _check_rounding(corners: Array, unit: str, path: str | Path, name: str) -> N
 
 
 def coordinate_rounding(corners: Array) -> float:
-    """Return the step to which coordinates (n, 3) are rounded, in their unit; 0: none is detected.
+    """Return the step of coordinates (n, 3), in their unit; 0: none is detected.
 
     Single precision and text of six or seven digits are detected, axis by axis. If more than half
-    of an axis's coordinates are multiples of four or five steps, they are exact round numbers.
+    of an axis's are multiples of four or five steps, they are exact round numbers.
     """
     return max((_axis_rounding(values) for values in corners.T), default=0.0)
 
 
 def _axis_rounding(values: Array) -> float:
-    """Return the step to which the coordinates (n,) along an axis are rounded; 0: none."""
     largest = float(np.abs(values).max(initial=0.0))
     if largest == 0.0:
         return 0.0
@@ -433,7 +432,7 @@ def _axis_rounding(values: Array) -> float:
 
 
 def _multiples(values: Array, step: float) -> NDArray[np.bool_]:
-    """Return which values (n,) are multiples of a step, within double precision."""
+    """Return which values (n,) are multiples, within double precision."""
     number = values / step
     return np.asarray(np.abs(number - np.rint(number)) <= 1e-5)
 

@@ -1,8 +1,8 @@
 """The knee's recorded motion: read, converted to knee coordinates, filtered, resampled.
 
 Recorded angles of any sequence are converted to the six coordinates of Grood and Suntay through the
-rotation matrix. A left knee is mirrored: the medial-lateral translation changes its sign. The
-clinical angles and the patella's sagittal coordinates keep their signs.
+rotation matrix. A left knee is mirrored: the medial-lateral translation changes its sign, clinical
+angles and the patella's sagittal coordinates do not.
 """
 
 from collections.abc import Sequence
@@ -64,7 +64,7 @@ fluoroscopy."""
 
 @dataclass(frozen=True, eq=False)
 class KneeMotion:
-    """The knee's motion, SI. A left knee is mirrored to a right one.
+    """The knee's motion, SI; a left knee is mirrored to a right one.
 
     Args:
         time: (f,) s.
@@ -115,7 +115,6 @@ def load_motion(
     insert mesh, T_femur_in_insert = T_insert_mesh_in_insert P T_femur_in_femoral_mesh.
 
     Args:
-        source: the scene's [motion].
         side: side of the knee; a left knee is mirrored.
         pose_insert_mesh_in_insert: (4, 4) m; z of the insert frame points to the subject's right,
             also for a left knee (not mirrored).
@@ -238,7 +237,7 @@ def _turn_signs(recorded: Table, source: MotionTable) -> Table:
 
 
 def _bending_role(recorded: Table, source: MotionTable) -> str:
-    """Return the role that shows flexion; for a pose, the rotation with the largest range."""
+    """Return the role that shows flexion; in a pose the rotation with the largest range."""
     if source.interpretation != "pose":
         return "flexion"
 
@@ -275,7 +274,7 @@ def _check_patella(patella: Array, path: Path) -> None:
 
 
 def _find_odd_steps(time: Array, values: Array, path: Path) -> tuple[OddSample, ...]:
-    """Return the odd samples of coordinates (n, 6 or 9). Raise if a coordinate changes too fast."""
+    """Return the odd samples (n, 6 or 9), and raise if a coordinate changes too fast."""
     odd: list[OddSample] = []
     for i, name in enumerate((*KNEE_COORDINATES, *PATELLA_COORDINATES)[: values.shape[1]]):
         moves = name.rsplit("_")[-1] in ("ap", "si", "ml")

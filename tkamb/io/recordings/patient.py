@@ -63,7 +63,7 @@ DE_LEVA: dict[Sex, dict[Segment, SegmentFractions]] = {
         "foot": SegmentFractions(0.0129, 0.0, (0.0, 0.0, 0.0)),
     },
 }
-"""De Leva's fractions. The foot is a point mass at the ankle, because it is light and slow."""
+"""De Leva's fractions; the foot, light and slow, is a point mass at the ankle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +80,7 @@ def segment_inertia(
 ) -> RigidInertia:
     """Return the inertia of a segment between two joint centres (3,) m, in their frame.
 
-    The longitudinal axis joins the centres. The AP and ML axes are those nearest to x and z of the
-    frame.
+    The longitudinal axis joins the centres; AP and ML axis are nearest to x and z of the frame.
     """
     fractions = DE_LEVA[sex][segment]
     mass = fractions.mass * body_mass
@@ -120,12 +119,12 @@ MAX_LATERAL_SHARE = 0.5
 
 
 THIGH = (0.2, 0.7)
-"""m: accepted distances from the origin of the femur link to the hip centre, from a child to a very
-tall adult."""
+"""m: accepted distances from the femur link's origin to the hip centre, child to very tall
+adult.
+"""
 
 SHANK = (0.15, 0.65)
-"""m: accepted distances from the ankle centre to the insert frame, from a child to a very tall
-adult."""
+"""m: accepted distances from ankle centre to insert frame, child to very tall adult."""
 
 MOST_TURNED = np.radians(40.0)
 """rad: largest angle between the insert's axes and the tibia's, due to slope, torsion and varus of
@@ -133,12 +132,7 @@ a deformed leg."""
 
 
 def load_urdf(patient: PatientTable, with_patella: bool) -> str:
-    """Return the URDF text of a right knee (a left one mirrored), complete and checked.
-
-    Args:
-        patient: the scene's [patient].
-        with_patella: whether the patella and its joints are needed.
-    """
+    """Return the URDF text of a right knee (a left one mirrored), complete and checked."""
     path = patient.urdf
     robot = _parse(path)
     check_elements(robot, path)
@@ -182,8 +176,8 @@ def _text(values: Array) -> str:
 def _mirror(robot: ElementTree.Element) -> None:
     """Reflect the chain in the sagittal plane (z to -z): a left knee becomes a right one.
 
-    Prismatic axes are not reflected. Instead, the reader of the motion reverses the sign of the
-    medial-lateral translation.
+    Prismatic axes are not reflected: the reader of the motion reverses the medial-lateral
+    translation instead.
     """
     for joint in robot.findall("joint"):
         _set_origin(joint, mirrored_pose(_origin(joint)))
@@ -199,7 +193,7 @@ def _mirror(robot: ElementTree.Element) -> None:
 
 
 def _check_places(robot: ElementTree.Element, path: Path) -> None:
-    """Raise an InputError unless hip and insert lie plausibly above the knee and the ankle."""
+    """Raise an InputError unless hip and insert lie plausibly above knee and ankle."""
     joints = {joint.get("name"): joint for joint in robot.findall("joint")}
     checks = (
         ("the hip", "femur", _fixed_pose(robot, "hip", "femur", path)[:3, 3], THIGH),

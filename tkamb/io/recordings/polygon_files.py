@@ -5,8 +5,8 @@ Colours, textures and normals are not read.
 OBJ: Wavefront, "Object Files", Advanced Visualizer manual, appendix B1. PLY: Turk, "The PLY
 polygon file format" (1994).
 
-The header of an array is its length in bytes. If the array is compressed by zlib, its header is the
-number and sizes of its blocks.
+The header of an array is its length in bytes or, if compressed by zlib, number and sizes of its
+blocks.
 
 Format: VTK User's Guide, "VTK XML file formats".
 """
@@ -79,7 +79,7 @@ def read_obj(path: str | Path) -> Polygons:
 
 @dataclass(frozen=True)
 class _Element:
-    """A kind of element of a PLY file: name, number of items, and their properties.
+    """A kind of element of a PLY file.
 
     A property has a name, a type and, if it is a list, the type of the list's length (else "").
     """
@@ -147,7 +147,7 @@ def _ply_header(content: bytes) -> tuple[str, list[_Element], int]:
 
 
 def _columns_to_read(element: _Element) -> list[int]:
-    """Return the indices of the properties to read: x, y and z, or the list of corners."""
+    """Return the properties to read: x, y and z, or the list of corners."""
     names = [name for name, _, _ in element.properties]
     if element.name == "vertex":
         return [names.index(axis) for axis in "xyz" if axis in names]
@@ -298,7 +298,7 @@ def read_binary_stl(path: Path) -> Array | None:
 
 
 def _is_text(content: bytes) -> bool:
-    """Return whether an STL is text. A binary STL may also begin with the word "solid"."""
+    """A binary STL may also begin with the word "solid"."""
     begin = content[:_TEXT_WITHIN].lower()
     words = b"facet" in begin or b"endsolid" in begin
     return content.lstrip()[:5].lower() == b"solid" and words and b"\0" not in begin
@@ -452,7 +452,7 @@ class _PolyData:
         return np.frombuffer(self._decode(source, raw, most * dtype.itemsize), dtype)
 
     def _decode(self, source: bytes, raw: bool, most: int) -> bytes:
-        """Return the bytes of an array after its header."""
+        """Return the bytes after its header."""
         size = self._header.itemsize
         if not self._compressed:
             header, remaining = self._decoded(source, size, raw)
@@ -479,7 +479,7 @@ class _PolyData:
         return b"".join(blocks)
 
     def _uncompressed(self, source: bytes, header: bytes, remaining: bytes, raw: bool) -> bytes:
-        """Return the bytes of an uncompressed array; in base64 the header may be separate."""
+        """In base64 the header may be separate."""
         size, length = len(header), int(np.frombuffer(header, self._header)[0])
         coded = source[: 4 * -(-size // 3)]
         if raw or (size % 3 and coded.endswith(b"=")):
@@ -487,7 +487,7 @@ class _PolyData:
         return self._decoded(source, size + length, raw)[0][size:]
 
     def _decoded(self, source: bytes, count: int, raw: bool) -> tuple[bytes, bytes]:
-        """Return the first `count` bytes of a raw or base64 text, and the remaining text."""
+        """Return the first `count` bytes of a raw or base64 text, and the rest."""
         length = count if raw else 4 * -(-count // 3)
         piece = source[:length]
         packed = piece if raw else base64.b64decode(piece, validate=True)

@@ -1,6 +1,6 @@
 """Tables of the scene for the patient and the recordings, and their base class, units and limits.
 
-Units are in the key names. The code that uses a value converts it to SI.
+Units are in the key names; the code that uses a value converts it to SI.
 """
 
 from pathlib import Path
@@ -11,7 +11,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, model
 LengthUnit = Literal["m", "cm", "mm", "inch"]
 AngleUnit = Literal["rad", "deg"]
 Number = Annotated[float, Strict()]
-"""A number. `true` and a number in quotes are refused."""
+"""A number; `true` and a number in quotes are refused."""
 Count = Annotated[int, Strict()]
 Switch = Annotated[bool, Strict()]
 Vector = tuple[Number, Number, Number]
@@ -63,9 +63,9 @@ Band = Annotated[Number, zero_or_within(0.1, 50, "give it in millimetres")]
 """mm: distance up to which a tendon wraps sections beside its sagittal plane; zero: this plane
 only."""
 Point = Annotated[Vector, within(-1000, 1000, "give it in millimetres")]
-"""mm: point on a bone. The limit allows for a bone of 0.6 m and an origin beside it."""
+"""mm: point on a bone of at most 0.6 m, or an origin beside it."""
 Offset = Annotated[Vector, within(-600, 600, "give it in millimetres")]
-"""mm: position of a mesh's origin in a link. The limit is the length of a bone."""
+"""mm: position of a mesh's origin in a link, within the length of a bone."""
 Turn = Annotated[Vector, within(-360, 360, "give it in degrees")]
 
 

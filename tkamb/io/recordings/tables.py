@@ -27,7 +27,7 @@ TRC_LABELS = 3
 
 _NOT_A_NUMBER = re.compile(r"[+-]?(nan(\(\w*\))?|1\.#(ind|qnan)0*)")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,3})?")
-"""A plain decimal number. Python's float would also accept 1_000 and digits of other scripts."""
+"""A plain decimal number, while Python's float also accepts 1_000 and other digits."""
 _NUMBER_CHARACTERS = "0123456789+-.eE "
 """Characters of plain decimal numbers."""
 _INFINITE = re.compile(r"[+-]?inf(inity)?")
@@ -79,7 +79,7 @@ class Table:
         return self.columns[name]
 
     def complete_column(self, name: str) -> Array:
-        """Return one column, in which every value must be finite."""
+        """Return one column, which must be finite."""
         values = self.column(name)
         gaps = np.flatnonzero(~np.isfinite(values))
         if len(gaps):
@@ -143,7 +143,7 @@ def read_table(path: Path, format: str | None = None) -> Table:
 
 
 def with_unit(table: Table, length_unit: str | None) -> Table:
-    """Return a table with the unit of length that the user states; None: unchanged."""
+    """Return a table with the user's unit of length; None: unchanged."""
     if length_unit is None:
         return table
     if table.path.suffix.lower() == ".c3d" and table.length_unit is not None:
@@ -158,9 +158,9 @@ def with_unit(table: Table, length_unit: str | None) -> Table:
 def read_csv(path: Path) -> Table:
     """Read comma-separated values with one header row.
 
-    Semicolons or tabs may separate the cells, with points or commas in the numbers; a notice
-    says so. Empty lines and lines that begin with # are skipped. Empty cells after the last named
-    column are skipped, too, because some programs end every line with a comma.
+    Semicolons or tabs may separate the cells, with points or commas in the numbers; a notice says
+    so. Lines that are empty or begin with # are skipped, and empty cells after the last named
+    column, because some programs end every line with a comma.
     """
     lines = [
         (number, line.replace('"', ""))
@@ -185,7 +185,7 @@ def read_csv(path: Path) -> Table:
 def _with_points(
     rows: list[tuple[int, list[str]]], sign: str, path: Path
 ) -> tuple[list[tuple[int, list[str]]], tuple[str, ...]]:
-    """Return rows with points in the numbers, and a notice on the separator."""
+    """Return rows with points in the numbers, and a notice."""
     cells = [cell.strip() for _, row in rows[1:] for cell in row]
     comma = next((cell for cell in cells if _COMMA_NUMBER.fullmatch(cell)), None)
     point = next((cell for cell in cells if "." in cell and _NUMBER.fullmatch(cell)), None)
@@ -240,8 +240,8 @@ def _row_notices(stated: str | None, rows: int) -> tuple[str, ...]:
 def read_trc(path: Path) -> Table:
     """Read markers of a `.trc` file.
 
-    A marker at exactly (0, 0, 0), an empty cell and NaN are gaps. Tabs separate the cells, or
-    blanks in a line without tabs. Markers without a label get names like `marker 7`.
+    A marker at exactly (0, 0, 0), an empty cell and NaN are gaps. Tabs separate cells, or blanks in
+    a line without tabs. Markers without a label get names like `marker 7`.
     """
     lines, changes = tab_separated(read_lines(path), TRC_LABELS)
     if len(lines) < 6 or not lines[0].startswith("PathFileType"):
@@ -280,7 +280,7 @@ def read_trc(path: Path) -> Table:
 
 
 def _trc_cells(line: str) -> list[str]:
-    """Return the cells of a line, separated by tabs or, in a line without tabs, by blanks."""
+    """Return the cells between tabs or, in a line without tabs, blanks."""
     if "\t" not in line.strip():
         return line.split()
     cells = [cell.strip() for cell in line.split("\t")]
@@ -296,9 +296,9 @@ def _filled(cells: list[str]) -> int:
 def _trc_labels(names: str, axes: str, usual: int, path: Path) -> list[str]:
     """Return a label per marker; "" for a marker without a label.
 
-    The line of labels has a label every three cells. Some programs write blanks in place of tabs.
-    Then the labels are read in order, if there are as many as markers. `usual` is the median number
-    of cells in a row.
+    The line of labels has a label every three cells. Some programs write blanks in place of tabs:
+    then as many labels as markers are read in order. `usual` is the median number of cells in a
+    row.
     """
     count = max(len(axes.split()) // 3, math.ceil((usual - 2) / 3))
     cells = [cell.strip() for cell in names.split("\t")][2:]
@@ -321,7 +321,7 @@ def _trc_labels(names: str, axes: str, usual: int, path: Path) -> list[str]:
 
 
 def _trc_unit(header: dict[str, str], path: Path) -> str | None:
-    """Return the unit of length that a .trc states, like "mm"; None for an unknown unit."""
+    """Return the stated unit of length, like "mm"; None for an unknown one."""
     scale = metres(header.get("Units", ""))
     return next((name for name, value in LENGTH.items() if value == scale), None)
 
@@ -329,7 +329,7 @@ def _trc_unit(header: dict[str, str], path: Path) -> str | None:
 def read_c3d_markers(path: Path) -> Table:
     """Return the markers of a C3D file, in m, at the times of the recording.
 
-    If the file's word for the unit is unknown, the numbers are as in the file, without a unit.
+    With an unknown word for the unit, the numbers are as in the file.
     """
     from tkamb.io.recordings.c3d import read_c3d
 
@@ -353,9 +353,9 @@ def read_c3d_markers(path: Path) -> Table:
 
 
 def _exact_time(time: Array, frame: Array, rate: str) -> Array:
-    """Return evenly spaced times if the time column is these times rounded; else the column.
+    """Return evenly spaced times if the column is these times rounded; else the column.
 
-    The spacing follows from the rate (Hz). The offset is the best fit to the column.
+    Their spacing follows from the rate (Hz), their offset is the best fit.
     """
     try:
         period = 1.0 / float(rate)
@@ -442,8 +442,8 @@ SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
 def read_lines(path: Path) -> list[str]:
     """Return the lines of a text file.
 
-    A byte order mark decides the encoding; without one it is UTF-8. If the bytes are not valid
-    UTF-8, it is Latin-1, which older programs write.
+    A byte order mark decides the encoding; without one it is UTF-8, or Latin-1, which older
+    programs write, if the bytes are not valid UTF-8.
     """
     content = read_bytes(path, TABLE_BYTES)
     encodings = [name for mark, name in BYTE_ORDER_MARKS.items() if content.startswith(mark)]

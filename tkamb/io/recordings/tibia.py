@@ -1,7 +1,7 @@
 """The pose of the shank in the laboratory: from a sagittal lean, poses, or shank markers.
 
-The laboratory is x forward, y up, z to the subject's right. The tibia link's origin is the
-ankle centre. A left shank is mirrored to a right one.
+The laboratory is x forward, y up, z to the subject's right, the tibia link's origin the ankle
+centre; a left shank is mirrored.
 """
 
 from dataclasses import dataclass, replace
@@ -79,11 +79,10 @@ class BodyMotion:
 def load_tibia(source: TibiaTable, time: Array, side: Side, cutoff_Hz: Cutoff) -> BodyMotion:
     """Return the tibia's motion at the frames of the knee's motion.
 
-    The recording is filtered before it is evaluated at the frames. If it is longer than `time`, the
-    filter's errors at its ends are outside `time`.
+    The recording is filtered first, so that the filter's errors at the ends of a longer one are
+    outside `time`.
 
     Args:
-        source: the scene's [tibia].
         time: (f,) s of the frames, on the file's clock.
         cutoff_Hz: cut-off of the motion, used if `source` states none.
     """
@@ -110,7 +109,7 @@ def load_tibia(source: TibiaTable, time: Array, side: Side, cutoff_Hz: Cutoff) -
 
 
 def _odd_poses(recorded: Table, stamps: Array, poses: Array, time: Array) -> tuple[OddSample, ...]:
-    """Return the odd samples of the shank's two ends."""
+    """Return the odd samples of both ends of the shank."""
     near = (stamps >= time[0] - WINDOW) & (stamps <= time[-1] + WINDOW)
     ends = {
         "ankle": np.zeros(3),
@@ -135,7 +134,7 @@ def _odd_poses(recorded: Table, stamps: Array, poses: Array, time: Array) -> tup
 def _sagittal(
     source: TibiaTable, recorded: Table, time: Array, side: str, cutoff: Cutoff
 ) -> BodyMotion:
-    """Return the motion of a shank that leans about the laboratory's z over a fixed ankle."""
+    """The shank leans about the laboratory's z over a fixed ankle."""
     check_roles(source.columns, ("time", "angle"), recorded.path, "tibia")
     stamps = recorded.time(source.columns.get("time", "time"))
     lean = recorded.complete_column(source.columns.get("angle", "angle"))

@@ -1,7 +1,7 @@
 """Checks of a patient's URDF: numbers, one tree, the exact knee chain, physical inertias.
 
-Parsers of URDF silently ignore unknown attributes and fill in missing ones. A misspelt attribute
-then becomes zero, and a joint without limits gets another type. These checks raise errors instead.
+Parsers of URDF silently ignore unknown attributes and fill in missing ones: a misspelt one becomes
+zero, and a joint without limits gets another type. These checks raise errors instead.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -63,8 +63,9 @@ _MANY = {"visual", "collision"}
 _TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 _ANKLE_JOINT = "ankle"
 _AXIS_ROUNDING = 1e-6
-"""1: largest difference of a unit axis from its nominal axis that counts as rounding.
-Programs write six digits. The nominal axis replaces it."""
+"""1: largest difference of a unit axis from its nominal axis, which replaces it, that counts as
+rounding to six digits.
+"""
 
 
 # rad: a larger angle is assumed to be in degrees. Angles in a URDF are below one
@@ -196,8 +197,8 @@ def check_chain(
     """Raise an InputError unless the joints are exactly those of docs/patient.md.
 
     The six knee joints and the three joints of the patella must have the right type, axis, limits,
-    order and origin (the identity inside a chain). Links between them must have no mass. Except the
-    ankle, no other joint may move.
+    order and origin (the identity inside a chain). Links between them must have no mass, and no
+    other joint but the ankle may move.
 
     Args:
         robot: tree of a right leg, or of a mirrored left leg.
@@ -231,7 +232,7 @@ def _check_axes(
     path: Path,
     side: str,
 ) -> None:
-    """Raise an InputError unless each joint has its type and axis, and does not mimic another."""
+    """Raise an InputError for another type or axis, or a joint that mimics another."""
     axes = {name: numbers_of(joints[name].find("axis"), "xyz", "1 0 0") for name in expected}
     for name, (_, axis) in expected.items():
         length = float(np.linalg.norm(axes[name]))
@@ -283,7 +284,7 @@ def _check_order(
     between: tuple[str, str],
     path: Path,
 ) -> None:
-    """Raise an InputError unless the joints form a chain at one point, without mass inside."""
+    """Raise an InputError unless joints form a chain at one point, without mass."""
     masses = {str(link.get("name")): link.find("inertial/mass") for link in robot.findall("link")}
     order = f"the order is {between[0]}, {', '.join(names)}, {between[1]}"
     link = between[0]

@@ -47,7 +47,7 @@ logger = logging.getLogger("tkamb")
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """The input of a run. Parts that are absent from the scene are None.
+    """The input of a run; absent parts are None.
 
     Args:
         motion: coordinates of the knee, and of a recorded patella, per frame.
@@ -101,7 +101,7 @@ class Case:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Notices on the recordings: how they were read, and what of them is not used."""
+        """Notices on how recordings were read, and what of them is not used."""
         parts = (self.motion, self.tibia, self.ground, self.measured, self.emg)
         remarks = [remark for part in parts if part is not None for remark in part.remarks]
         return tuple(dict.fromkeys(remarks))
@@ -178,11 +178,10 @@ def _recordings(
 
 
 def _common_part(scene: Scene) -> MotionTable | None:
-    """Return the table [motion] with the interval that the ground reaction covers.
+    """Return [motion] with the interval that the ground reaction covers.
 
-    A scene without an interval uses the whole recording, but motion and ground reaction may begin
-    and end at slightly different times. The result is None if the interval cannot or need not be
-    changed.
+    The whole recording may begin and end at slightly different times. It is None if the interval
+    cannot or need not be changed.
     """
     if scene.ground_reaction is None or scene.motion.interval_s or scene.motion.cycle_s:
         return None
@@ -275,7 +274,7 @@ def with_insert(case: Case, mesh: Path) -> Case:
 
 
 def _derived(scene: Scene, motion: KneeMotion, parts: ImplantParts) -> KneeMotion:
-    """Return the motion with coordinates from the surfaces: initial guess, or roll and slip."""
+    """Return the motion with coordinates from the surfaces: guess, or roll and slip."""
     table = scene.motion
     if motion.unrecorded or table.motion == "roll-slip":
         check_frames(motion.time, table.cutoff_Hz, table.frames)

@@ -19,9 +19,9 @@ def seated_motion(
 ) -> KneeMotion:
     """Return the motion with an initial guess of the coordinates that were not recorded.
 
-    Unrecorded rotations are zero. Unrecorded AP and ML place the mean of the condyles' lowest
-    points above the insert's origin. Unrecorded SI lowers the femur to first touch. The velocities
-    and accelerations of this guess determine the inertia forces and the direction of sliding.
+    Unrecorded rotations are zero, AP and ML place the mean of the condyles' lowest points above the
+    insert's origin, and SI lowers the femur to first touch. The rates of this guess determine
+    inertia forces and the direction of sliding.
 
     Args:
         motion: recorded motion; `motion.unrecorded` names the missing coordinates.
@@ -58,8 +58,8 @@ def rolling_motion(
 ) -> KneeMotion:
     """Return the motion with AP and SI from rolling and slipping of the femur on the insert.
 
-    SI lowers the femur until one condyle touches. Rotations and ML do not change. The new AP and SI
-    are filtered and differentiated like recorded coordinates, but never as a closed cycle.
+    SI lowers the femur to first touch; rotations and ML do not change. AP and SI are filtered and
+    differentiated like recorded coordinates, but never as a closed cycle.
 
     Args:
         femoral: femoral component, femoral frame.
@@ -82,7 +82,7 @@ def rolling_motion(
 
 
 def _first_lost(places: Array, time: Array) -> float | None:
-    """Return the first time, s, at which a coordinate of `places` (f, 6) is not finite, or None."""
+    """Return the first time, s, of a coordinate (f, 6) that is not finite, or None."""
     missing = np.flatnonzero(~np.isfinite(places).all(axis=1))
     return float(time[missing[0]]) if len(missing) else None
 
@@ -90,7 +90,7 @@ def _first_lost(places: Array, time: Array) -> float | None:
 def _with_coordinates(
     motion: KneeMotion, places: Array, columns: list[int], cutoff: Cutoff
 ) -> KneeMotion:
-    """Return the motion with `columns` from `places` (f, 6), filtered and differentiated."""
+    """Return the motion with `columns` from `places` (f, 6), filtered."""
     values = (motion.coordinates.copy(), motion.velocity.copy(), motion.acceleration.copy())
     result = differentiate_coordinates(motion.time, places[:, columns], cutoff)
     for value, new in zip(values, result, strict=True):

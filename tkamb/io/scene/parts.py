@@ -1,4 +1,4 @@
-"""Implants, muscles and ligaments of a scene, in SI units. A left knee is mirrored."""
+"""Implants, muscles and ligaments of a scene, in SI units; a left knee is mirrored."""
 
 import re
 from dataclasses import replace
@@ -36,7 +36,7 @@ NAN = float("nan")
 class ImplantParts:
     """The implant's surfaces in the frames of their links, and the poses of their meshes.
 
-    Parts that the scene does not need are None.
+    Parts that are not needed are None.
 
     Args:
         insert_alone: whether the insert is the only part to read.

@@ -1,8 +1,8 @@
-"""The scene: the file that says what exists and what is modelled.
+"""The scene: the TOML file that says what exists and what is modelled.
 
-A scene is a TOML file. Units are in the key names, paths are relative to the file, and an unknown
-key is an error. If a table is absent, its subject is not modelled. `load_scene` reads and validates
-a scene, but not the files that the scene names.
+Units are in the key names, paths are relative to the file, an unknown key is an error, and the
+subject of an absent table is not modelled. `load_scene` does not read the files that the scene
+names.
 """
 
 import json
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 
 class Scene(SceneTable):
-    """The content of a scene file. Each table has a class of its own."""
+    """The content of a scene file."""
 
     base: str | None = Field(
         None,
@@ -197,12 +197,7 @@ def load_scene(
 
 
 def with_preset(scene: Scene, preset: str, overrides: dict[str, Any] | None = None) -> Scene:
-    """Return a scene with a preset applied. The scene's overrides stay.
-
-    Args:
-        preset: name of a preset (`tkamb.io.presets`).
-        overrides: dotted key -> value that replaces the preset's value.
-    """
+    """Return a scene with a preset applied. Its overrides stay, and replace the preset's values."""
     content = scene.model_dump(exclude_unset=True)
     more = scene.overrides | (overrides or {})
     applied = _apply_preset(content, preset, more, "scene")
@@ -212,7 +207,7 @@ def with_preset(scene: Scene, preset: str, overrides: dict[str, Any] | None = No
 
 
 def with_overrides(scene: Scene, overrides: dict[str, Any]) -> Scene:
-    """Return a scene with overrides applied, as `load_scene` applies them to a file.
+    """Return a scene with overrides, as `load_scene` applies them to a file.
 
     Args:
         scene: the scene; its overrides and its preset stay.
@@ -234,10 +229,7 @@ def _changed(content: dict[str, Any], overrides: dict[str, Any]) -> Scene:
 
 
 def _apply_overrides(content: dict[str, Any], overrides: Mapping[str, Any]) -> None:
-    """Apply overrides to a content, in place.
-
-    An override of a material or yield stress removes the same quantity from its other table.
-    """
+    """An override of a material or yield stress removes the quantity from its other table."""
     for key, value in overrides.items():
         _override(content, key, value)
     tables = {key.partition(".")[0] for key in overrides}
@@ -312,7 +304,7 @@ def _override(content: dict[str, Any], dotted: str, value: Any) -> None:
 
 
 def _complaint(error: ValidationError, path: Path, overrides: dict[str, Any]) -> InputError:
-    """Return the error to correct first. Unknown keys come first: they may be misspelt keys."""
+    """Return the error to correct first: unknown keys may be misspelt ones."""
     result = error.errors()
     rank = {"extra_forbidden": 0, "missing": 2}
     first = min(result, key=lambda complaint: rank.get(complaint["type"], 1))
@@ -340,7 +332,7 @@ def _complaint(error: ValidationError, path: Path, overrides: dict[str, Any]) ->
 
 
 def _as_list(key: str, value: Any, from_command_line: bool) -> str:
-    """Return words on how to write a single value as a list."""
+    """Return how to write a single value as a list."""
     if isinstance(value, dict):
         return f"is one table; write [[{key}]], with two brackets, above each"
     words = json.dumps(value, default=str)
@@ -367,14 +359,14 @@ def _model_at(place: tuple[int | str, ...]) -> type[BaseModel] | None:
 
 
 def _table_in(annotation: Any) -> type[BaseModel] | None:
-    """Return the table's class in an annotation, such as `T`, `T | None` or `tuple[T, ...]`."""
+    """Return the class in `T`, `T | None` or `tuple[T, ...]`."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     return next((t for a in get_args(annotation) if (t := _table_in(a)) is not None), None)
 
 
 def _tables_with(complaint: ErrorDetails) -> str:
-    """Return words on the other tables that have an unknown key, or ""."""
+    """Return which other tables have an unknown key, or ""."""
     key = complaint["loc"][-1]
     table = _model_at(complaint["loc"][:-1])
     tables = {name: _model_at((name,)) for name in Scene.model_fields}
@@ -383,7 +375,7 @@ def _tables_with(complaint: ErrorDetails) -> str:
 
 
 def _resolve_paths(model: Any, folder: Path) -> Any:
-    """Return the model with absolute paths, from paths relative to the scene's folder."""
+    """Make paths relative to the scene's folder absolute."""
     changed: dict[str, Any] = {}
     for name in type(model).model_fields:
         value = getattr(model, name)

@@ -1,7 +1,7 @@
 """The tables of the scene file, with the meaning, unit and limits of each key.
 
-Units are in the key names. Unknown keys are errors. All tables are frozen. The tables of recordings
-are in `recording_tables`.
+Units are in the key names, and unknown keys are errors. The tables of recordings are in
+`recording_tables`.
 """
 
 from pathlib import Path
@@ -267,7 +267,7 @@ class MuscleTable(SceneTable):
 
 
 class QuadricepsTable(SceneTable):
-    """Quadriceps line: the short form of a [[muscle]] with the name quadriceps and two points.
+    """Quadriceps line: the short form of a [[muscle]] of this name with two points.
 
     It runs from the vastus intermedius origin to the patella and wraps the sagittal outline of
     the femoral component, and of `bone` if given.

@@ -1,7 +1,7 @@
 """The scene's table [uncertainty]: the standard deviation of the error of each input.
 
-Every key is the standard deviation of a normal error, in the key's unit. A key called relative is
-the standard deviation of a positive (lognormal) factor with mean 1. Zero: the input does not vary.
+A key is the standard deviation of a normal error, in its unit, or if called relative that of a
+positive (lognormal) factor with mean 1. Zero: the input does not vary.
 """
 
 from dataclasses import asdict, dataclass
@@ -104,10 +104,10 @@ class CorrelationTable(SceneTable):
 
 
 class UncertaintyTable(SceneTable):
-    """Errors of the inputs, for `tkamb uncertainty`. Each key is a standard deviation.
+    """Errors of the inputs, for `tkamb uncertainty`. A pose error is one offset per sample plus
+    noise per frame, every other error one draw per sample.
 
-    A pose error is one offset per sample plus noise per frame. Every other error is one draw per
-    sample. Errors are independent, except those in [[uncertainty.correlation]].
+    Errors are independent, except those in [[uncertainty.correlation]].
     """
 
     seed: Count = Field(
@@ -223,12 +223,7 @@ class UncertaintyTable(SceneTable):
     )
 
     def completed(self, from_markers: bool) -> Self:
-        """Return the table with default deviations for the pose coordinates that it lacks.
-
-        Args:
-            from_markers: whether the knee's motion is from skin markers; otherwise the defaults
-                are of fluoroscopy.
-        """
+        """Return the table with default deviations for the pose coordinates that it lacks."""
         defaults = asdict(SKIN_MARKER_ERROR if from_markers else FLUOROSCOPY_ERROR)
         missing = {
             name: value

@@ -15,9 +15,8 @@ if TYPE_CHECKING:
 
 
 def lay_out(directory: Path, person: "Person | None" = None) -> Path:
-    """Write the starter scene with its files into a new or empty folder. Return the scene's path.
-
-    The folder is written completely or not at all.
+    """Write the starter scene into a new or empty folder, completely or not at all; return its
+    path.
 
     Args:
         person: the patient; None: a man of 75 kg and 1.75 m, right knee.

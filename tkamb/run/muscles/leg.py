@@ -9,8 +9,7 @@ tendon and the constant width w = l_o sin(alpha_o) of the fibres,
 
 f_l is a sum of three bell curves, f_v an arsinh, and f_p exponential beyond the optimal length. A
 path shorter than the tendon has no force. Some paths are longer than muscle and tendon, such as a
-path past the patella to the tibia. L is then the path length of the muscle's twin
-(`length_twins`).
+path past the patella to the tibia; L is then that of the muscle's twin (`length_twins`).
 
 Reference: De Groote et al., Ann Biomed Eng 44:2922 (2016), doi:10.1007/s10439-016-1591-9, with the
 coefficients of the authors' code, for which f_l(1) = f_v(0) = 1.
@@ -75,7 +74,6 @@ def rigid_tendon_strength(
     """Return the active forces at full activation and the passive forces, N, (..., m).
 
     Args:
-        muscles: m muscles.
         lengths_m: path lengths, m, (..., m).
         speeds: rates of the path lengths, m/s, (..., m).
 
@@ -114,16 +112,15 @@ TOLERANCE = 1e-6
 
 
 def leg_bones(leg: Leg) -> dict[str, tuple[str, ...]]:
-    """Return bone -> its bodies. The bones are femur, patella (if any), tibia and foot."""
+    """Return bone (femur, patella if any, tibia, foot) -> its bodies."""
     bones = {"femur": leg.femur, "tibia": leg.tibia, "foot": leg.foot}
     return bones if leg.patella is None else {**bones, "patella": (leg.patella,)}
 
 
 def leg_coordinates(leg: Leg) -> tuple[str, ...]:
-    """Return the coordinates that the muscles of a leg balance.
+    """Return the coordinates that muscles balance: hip, knee flexion, ankle and subtalar joint.
 
-    They belong to hip, knee flexion, ankle and the joint below the ankle (subtalar). Locked and
-    dependent coordinates are excluded.
+    Locked and dependent ones are excluded.
     """
     if leg.flexion is None:
         raise InputError(f"has a knee '{leg.knee.name}' without flexion", leg.model.name)
@@ -147,7 +144,7 @@ ELSEWHERE = 10.0
 
 
 def default_reserves(leg: Leg) -> dict[str, float]:
-    """Return coordinate -> size of its reserve, N·m, for the balanced coordinates of a leg."""
+    """Return coordinate -> size of its reserve, N·m."""
     coordinates = leg.model.coordinates
     return {
         name: AT_HIP if coordinates[name].joint == leg.hip.name else ELSEWHERE
@@ -168,10 +165,9 @@ def leg_muscles(leg: Leg) -> tuple[str, ...]:
 
 
 def muscle_groups(leg: Leg, muscles: Sequence[OpenSimMuscle]) -> dict[str, tuple[str, ...]]:
-    """Return group -> names of its muscles.
+    """Return group -> names of its muscles, by the ends of their paths.
 
-    The ends of a muscle's path determine its group. Pelvis and thigh are one region. Muscles that
-    end on the patella or pass it are the extensors of the knee.
+    Pelvis and thigh are one region; muscles that end on the patella or pass it are extensors.
     """
     bones = leg_bones(leg)
 
@@ -189,11 +185,11 @@ def muscle_groups(leg: Leg, muscles: Sequence[OpenSimMuscle]) -> dict[str, tuple
 
 
 def length_twins(model: OpenSimModel) -> dict[str, str]:
-    """Return muscle -> its twin, for the muscles with a twin.
+    """Return muscle -> its twin, if it has one.
 
-    A twin is a copy of a muscle with the same strength, fibre length, tendon length and first
-    point, but fewer path points. Models contain twins for muscles with a path past the patella to
-    the tibia. The twin's path has the length of muscle and tendon. The twin itself must not pull.
+    A twin is a copy with the same strength, fibre length, tendon length and first point, but fewer
+    path points, for a path past the patella to the tibia. Its path has the length of muscle and
+    tendon; it must not pull itself.
     """
     pairs = [p for p in combinations(model.muscles.values(), 2) if _same_muscle(*p)]
     ordered = [sorted(pair, key=lambda muscle: len(muscle.path.points)) for pair in pairs]
@@ -201,9 +197,9 @@ def length_twins(model: OpenSimModel) -> dict[str, str]:
 
 
 def foot_loads(model: OpenSimModel, reactions: Mapping[str, GroundReaction]) -> dict[str, Array]:
-    """Return body -> wrench (f, 6) on each foot, in ground about its origin, moment first.
+    """Return body -> wrench (f, 6), in ground about its origin, moment first.
 
-    The wrench acts on the heaviest body below the ankle.
+    It acts on the heaviest body below the ankle.
 
     Args:
         model: OpenSim model. Its ground is the laboratory, x forward, y up, z right.
@@ -220,8 +216,8 @@ def foot_loads(model: OpenSimModel, reactions: Mapping[str, GroundReaction]) -> 
 def check_extensors(leg: Leg, muscles: tuple[str, ...]) -> None:
     """Raise if muscles end on a patella whose pose does not depend on the knee's flexion.
 
-    A patellar ligament then transmits their moment to the tibia. It is no muscle, so that the
-    moment arm -dL/dq about the flexion is near zero.
+    A patellar ligament, which is no muscle, then transmits their moment to the tibia, so that
+    -dL/dq about the flexion is near zero.
     """
     if leg.patella is None:
         return

@@ -1,8 +1,8 @@
 """The muscles of a scene with [muscles]: static optimisation in each frame.
 
-The OpenSim model provides the rows of hip, ankle and subtalar joint for all frames. The equations
-of the knee provide the row of its flexion (`tkamb.knee.crossing`). The tension of the extensor
-group is therefore the same in the optimisation and in the equations of the knee.
+The OpenSim model provides the rows of hip, ankle and subtalar joint, the equations of the knee that
+of its flexion (`tkamb.knee.crossing`). The tension of the extensor group is therefore the same in
+both.
 """
 
 from collections.abc import Mapping
@@ -44,8 +44,7 @@ class SharedMuscles:
     """The muscles of a leg in all frames.
 
     Args:
-        trial: optimisation problems and muscle lines of all frames.
-        is_left: whether the leg is a left one. Its knee is computed as its mirror image.
+        is_left: whether the leg is a left one, whose knee is computed as its mirror image.
     """
 
     def __init__(self, trial: KneeTrial, is_left: bool = False) -> None:
@@ -83,11 +82,8 @@ class SharedMuscles:
 
 @dataclass(frozen=True, eq=False)
 class FrameMuscles:
-    """The muscles of a leg in one frame.
-
-    Args:
-        trial: optimisation problems and muscle lines of all frames.
-        lines: muscle lines across the knee in this frame.
+    """Args:
+    lines: muscle lines across the knee in this frame of the `trial`.
     """
 
     trial: KneeTrial
@@ -143,8 +139,8 @@ class FrameMuscles:
     def solve(self, geometry: KneeGeometry, friction: float) -> tuple[KneeGeometry, SolvedLoads]:
         """Return the geometry with the muscle forces, and all loads.
 
-        Contact points and lines are fixed, so that one pass is exact. It is repeated if a condyle
-        lifts off.
+        With fixed contact points and lines one pass is exact; it is repeated if a condyle lifts
+        off.
         """
         lifted = geometry.lifted
         for _ in range(MAX_ITERATIONS):
@@ -163,7 +159,7 @@ class FrameMuscles:
     ) -> MuscleShare:
         """Return the forces that keep the least share on each condyle or, if none do, all forces.
 
-        `points` are the contact points of the condyles; without any, the share is not required.
+        `points` are the contact points of condyles, which alone must have it.
         """
         trial, k, required = self.trial, self.k, self.trial.problems.sharing.least_share
         rows = condyle_rows(geometry, self.lines, points) if required > 0.0 else None
@@ -251,7 +247,7 @@ def load_muscles(case: Case) -> SharedMuscles:
 
 
 def groups_of(case: Case) -> tuple[str, ...]:
-    """Return the names of the muscle groups of a case with [muscles]."""
+    """Return the muscle groups of a case with [muscles]."""
     table = case.scene.muscles
     assert table is not None
     return group_names(table.model, case.scene.patient.side)

@@ -1,8 +1,8 @@
 """Plausibility of a case: a question for each possible but unlikely input.
 
-An impossible input is refused when it is read. A case with unlikely input is computed. A question
-then names the likely mistake in summary, report and the status of the frames concerned. The limits
-are wide, since mistakes such as wrong signs and units exceed them by far.
+An impossible input is refused when it is read; a case with an unlikely one is computed, and a
+question names the likely mistake in summary, report and the status of the frames. The limits are
+wide, since mistakes such as wrong signs and units exceed them by far.
 """
 
 from collections.abc import Sequence

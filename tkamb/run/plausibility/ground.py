@@ -44,15 +44,14 @@ class GroundReactionLimitSettings:
     """m: least mean distance of the centre of pressure ahead of the ankle. Seven recordings have
     0.019 to 0.061, and -0.019 or less with the opposite sign."""
     ankle_distance: float = 0.015
-    """m: horizontal distance from the ankle. A centre of pressure that stays within it is likely
-    in another unit. In standing it is 0.04 m ahead of the
-    ankle."""
+    """m: horizontal distance from the ankle within which a centre of pressure that stays is likely
+    in another unit. In standing it is 0.04 m ahead of the ankle.
+    """
     max_unloaded_stance: float = 0.15
     """s: longest time without force on a standing foot. Four recorded walks have at most 0.02 s.
     A missing force plate causes 0.4 s."""
     unloaded_force: float = 0.05
-    """BW: force below which a foot is unloaded. The noise of force plates is
-    smaller."""
+    """BW: force below which a foot is unloaded; the noise of force plates is smaller."""
     max_peak_ratio: float = 1.6
     """1: largest ratio of the peak forces of one foot in a walk. Three recordings
     have 1.1."""
@@ -134,9 +133,8 @@ def step_questions(case: Case) -> Iterator[Question]:
 def direction_questions(case: Case) -> Iterator[Question]:
     """Ask about an unlikely direction of the horizontal force.
 
-    The ground reaction passes near the body's centre of mass, which is near the hip. It is
-    therefore inclined forward or backward like the line from the centre of pressure to the hip,
-    and inward, towards the other leg.
+    The ground reaction passes near the body's centre of mass, and so near the hip: it is inclined
+    forward or backward like the line from the centre of pressure to the hip, and inward.
     """
     ground, loaded = case.ground, _well_loaded(case)
     yield from _sideways_question(case)
@@ -157,7 +155,7 @@ def direction_questions(case: Case) -> Iterator[Question]:
 
 
 def _sideways_question(case: Case) -> Iterator[Question]:
-    """Ask about a force that points away from the other leg. It needs no centre of pressure."""
+    """This question needs no centre of pressure."""
     ground = case.ground
     if ground is None or case.tibia is None:
         return
@@ -200,7 +198,7 @@ def posture_questions(case: Case) -> Iterator[Question]:
 
 
 def _well_loaded(case: Case) -> Mask:
-    """Return a mask (f,) of frames with a well loaded foot; False without centre of pressure."""
+    """Return (f,) whether a foot is well loaded; False without centre of pressure."""
     ground, table = case.ground, case.scene.ground_reaction
     if ground is None or case.tibia is None or table is None or table.applied != "cop":
         return np.zeros(len(case.motion.time), bool)
@@ -209,7 +207,7 @@ def _well_loaded(case: Case) -> Mask:
 
 
 def _to_hip(case: Case) -> Array:
-    """Return the vector (f, 3) from the centre of pressure to the hip, laboratory axes, m."""
+    """Return (f, 3), m, laboratory axes, from the centre of pressure to the hip."""
     assert case.ground is not None and case.tibia is not None
     femur = case.tibia.pose @ case.chain.insert_in_tibia @ knee_pose(case.motion.coordinates)
     hip = transform(femur, case.chain.link_in("hip", "femur")[:3, 3][None])[:, 0]
@@ -217,7 +215,7 @@ def _to_hip(case: Case) -> Array:
 
 
 def _forward(case: Case) -> Array:
-    """Return the horizontal anterior direction (f, 3) of the shank, laboratory axes."""
+    """Return the shank's horizontal anterior direction (f, 3), laboratory axes."""
     assert case.tibia is not None
     forward = case.tibia.pose[:, :3, 0] * [1.0, 0.0, 1.0]
     return np.asarray(forward / np.maximum(np.linalg.norm(forward, axis=1), 1e-9)[:, None])

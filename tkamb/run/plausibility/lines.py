@@ -24,8 +24,9 @@ class LineLimitSettings:
     """1: largest strain of a ligament. Ligaments of the knee tear at 0.12 to 0.20 (Kennedy et al.
     1976, Butler et al. 1986)."""
     min_strain: float = -0.4
-    """1: least value of a ligament's largest strain in the motion. A bundle with
-    smaller strains has no effect in the motion."""
+    """1: least value of a ligament's largest strain in the motion. One with smaller strains has no
+    effect.
+    """
     max_attachment_distance: float = 0.16
     """m: largest distance of an attachment from the origin of insert or link. The
     superficial MCL, the farthest, ends 0.06 to 0.12 below the insert."""
@@ -99,9 +100,9 @@ def attachment_questions(case: Case) -> Iterator[Question]:
 
 
 def _on_carrier(case: Case, end: "LinkPoint") -> tuple[str, Array]:
-    """Return the bone of an attachment (femur, tibia or patella), and its position (3,), m.
+    """Return an attachment's bone (femur, tibia or patella), and its position (3,), m.
 
-    The position is in the insert frame for the tibia, else in the frame of the bone's link.
+    It is in the insert frame for the tibia, else in the link's frame.
     """
     chain = case.chain
     carrier = chain.carrier(end.link)
@@ -112,7 +113,7 @@ def _on_carrier(case: Case, end: "LinkPoint") -> tuple[str, Array]:
 
 
 def _is_plausible_end(carrier: str, place: Array) -> bool:
-    """Return whether a ligament may end at a position (3,), m, from `_on_carrier`."""
+    """Return whether a ligament may end there, see `_on_carrier`."""
     beyond = {"tibia": place[1], "femur": -place[1]}.get(carrier, 0.0)
     return (
         float(np.linalg.norm(place)) <= LINE_LIMITS.max_attachment_distance
@@ -142,7 +143,6 @@ def strain_questions(
 
     Args:
         strains: name of a bundle -> strain at the recorded poses, (f,).
-        time: times of the frames, s, (f,).
     """
     if not ligaments:
         return
@@ -225,7 +225,7 @@ def extensor_questions(case: Case, poses: Mapping[str, Array]) -> Iterator[Quest
 def side_questions(case: Case) -> Iterator[Question]:
     """Ask about heads and ligaments of a released patella on the wrong side of it.
 
-    The side is that of the name, or without such a name that of the other end.
+    The side is that of the name, or else of the other end.
     """
     ends = [
         (head.name, f"[[patella.head]] {head.name} insertion", head.insertion, head.origin)
@@ -261,13 +261,13 @@ def _side_of(place: float) -> str:
 
 
 def named_side(name: str) -> int:
-    """Return 1 if the name is that of a lateral part, -1 of a medial one, else 0."""
+    """Return 1 for the name of a lateral part, -1 of a medial one, else 0."""
     medial, lateral = "medial" in name.lower(), "lateral" in name.lower()
     return int(lateral) - int(medial)
 
 
 def _tendon(lengths: Array, declared: float) -> Iterator[Question]:
-    """Ask about unlikely lengths (f,), m, of the patellar ligament, or a wrong length_mm."""
+    """Ask about unlikely lengths (f,), m, or a wrong length_mm."""
     if not len(lengths):
         return
     low, high = float(lengths.min()), float(lengths.max())

@@ -1,9 +1,9 @@
 """Questions about the recorded movement: ranges, rates, outliers, signs of the pose.
 
 Signs: loaded condyles stay in contact with the insert, so that their gaps at the recorded poses
-vary little. With a wrong sign of AP the femur moves up the lips of the insert. With a wrong sign
-of axial rotation or adduction, one condyle rises and the other sinks. The check inverts one sign
-at a time. It asks about a sign if the gaps then vary much less.
+vary little. With a wrong sign of AP the femur moves up the insert's lips; with one of axial
+rotation or adduction, a condyle rises and the other sinks. The check inverts one sign at a time,
+and asks if the gaps then vary much less.
 """
 
 from collections.abc import Iterator, Sequence
@@ -126,7 +126,7 @@ def motion_questions(case: Case) -> Iterator[Question]:
 
 
 def _translation_questions(case: Case) -> Iterator[Question]:
-    """Ask about recorded translations that hardly change. Constant ones are prescribed values."""
+    """Ask about translations that hardly change; constant ones are prescribed values."""
     motion = case.motion
     names = ("ap", "si", "ml")
     if motion.unrecorded or motion.markers is not None:
@@ -217,8 +217,9 @@ class SignSettings:
     """Criteria for a question about the sign of a coordinate."""
 
     frames: int = 15
-    """1: number of checked frames, evenly spread over the motion. More frames change
-    the standard deviations by a few per cent only."""
+    """1: number of checked frames, evenly spread over the motion. More change the standard
+    deviations by a few per cent only.
+    """
     ap_spread: float = 0.6 * MILLIMETRE
     """m: standard deviation of the mean gap from which the sign of AP is checked. Fluoroscopy of
     subject DM has 0.3 mm, and 1.3 mm with the wrong sign."""
@@ -283,7 +284,7 @@ def sign_questions(case: Case) -> Iterator[Question]:
 
 
 def _gaps(clearance: "FirstTouch", coordinates: Array) -> Array:
-    """Return the vertical gaps of the condyles (f, 2), m; NaN for a condyle beside the insert."""
+    """Return the condyles' vertical gaps (f, 2), m; NaN beside the insert."""
     touches = [clearance.at(knee_pose(row)) for row in coordinates]
     return np.array([[np.nan if t is None else t.travel for t in pair] for pair in touches])
 

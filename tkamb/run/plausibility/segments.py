@@ -25,8 +25,7 @@ class SegmentLimitSettings:
     reciprocal. The ratio is up to 1.35 between cadaver studies, up to 1.3 with obesity, and 2.2 for
     pounds that are read as kilograms."""
     max_patella_offset: float = 0.05
-    """m: largest distance of the patella's centre of mass from its origin. A patella
-    is smaller."""
+    """m: largest distance of the patella's centre of mass from its origin; a patella is smaller."""
     max_insert_rotation: float = 20.0 * DEGREE
     """rad: largest rotation of the insert in the tibia. The slope is up to 10 deg,
     and definitions of the tibia's axes differ."""
@@ -125,7 +124,7 @@ def _of_patella(case: Case) -> Iterator[Question]:
 
 
 def _of_inertia(case: Case, link: str, end: Array) -> Iterator[Question]:
-    """Ask about centre of mass and radii of gyration of a segment from its origin to `end` (3,)."""
+    """Ask about a segment from its origin to `end` (3,)."""
     mass, centre, tensor = case.chain.segment(link)
     length = float(np.linalg.norm(end))
     along = end / length
@@ -165,8 +164,9 @@ class ImplantShapeLimitSettings:
     to front has less than 0.1."""
     min_opening_share: float = 0.05
     """1: a component opens in the direction from its surface's centroid to the centre of its
-    bounding box. This direction is checked if that distance is more than this share of the largest
-    extent. Ten components have 0.09 to 0.14, a sphere has 0."""
+    bounding box. It is checked if that distance is more than this share of the largest extent. Ten
+    components have 0.09 to 0.14, a sphere has 0.
+    """
     max_opening_angle: float = 60.0 * DEGREE
     """rad: largest angle between the opening of the component and superior. The same ten components
     have at most 27 deg."""
@@ -184,7 +184,8 @@ class ImplantShapeLimitSettings:
     dry joints 0.2."""
     outline_offset: float = 0.25
     """1: distance from the middle to the compared outlines of an insert, as a share of its width.
-    The condyles are there."""
+    The condyles lie there.
+    """
 
 
 IMPLANT_SHAPE_LIMITS = ImplantShapeLimitSettings()
@@ -213,7 +214,7 @@ def implant_questions(case: Case) -> Iterator[Question]:
 
 
 def _of_femoral(femoral: "Surface") -> Iterator[Question]:
-    """Ask about a flange that is not in front, or a component that does not open upward."""
+    """Ask about a flange behind, or a component that does not open upward."""
     low, high = femoral.bounds
     vertices = femoral.vertices
     top = vertices[:, 1] > high[1] - IMPLANT_SHAPE_LIMITS.flange_height_share * (high[1] - low[1])
@@ -238,7 +239,7 @@ def _of_femoral(femoral: "Surface") -> Iterator[Question]:
 
 
 def _of_insert(insert: "Surface") -> Iterator[Question]:
-    """Ask about a notch in front, by comparing the outlines at mid-width and at the condyles."""
+    """Ask about a notch in front, by outlines at mid-width and at the condyles."""
     low, high = insert.bounds
     heights, offsets = (
         np.array(AT_HEIGHTS),
@@ -264,7 +265,7 @@ def _of_insert(insert: "Surface") -> Iterator[Question]:
 
 
 def _of_button(button: "Surface") -> Iterator[Question]:
-    """Ask about a button with a flat side, the bone side, that does not face forward."""
+    """Ask about a flat bone side that does not face forward."""
     ways = np.vstack([np.eye(3), -np.eye(3)])
     flat = np.array([button.areas[button.face_normals @ way > FLAT].sum() for way in ways])
     largest = int(flat.argmax())

@@ -28,12 +28,9 @@ class PressureMap:
     """The pressure on the insert at one frame.
 
     Args:
-        frame: number of the frame among the computed frames of the run.
         points: map points in the insert frame, m, shape (n, 3).
         triangles: point numbers of the triangles between them, shape (k, 3).
         pressure: contact pressure at the points, Pa, shape (n,).
-        side: side of the knee, "right" or "left".
-        lateral: direction of the insert's z axis, "lateral" or "medial".
     """
 
     frame: int
@@ -49,13 +46,11 @@ class Outcome:
     """Results of one run.
 
     Args:
-        reason: reason why the whole run failed; "" if it did not.
         columns: name -> values (f,) of a modelled numeric column of results.csv, without computing
             times.
-        status: status of each frame.
         chosen: pressure map of one frame; None without contact.
-        wear: name -> wear result, such as "volume_mm3_per_Mc"; empty if wear was not computed.
-        wear_problem: reason why the wear computation failed; "" if it did not.
+        wear_problem: reason why the wear computation failed, as `reason` for the whole run; "" if
+            it did not.
     """
 
     reason: str
@@ -76,7 +71,7 @@ class Outcome:
         return sum(status != "ok" for status in self.status) - self.failed_frames
 
     def shard(self) -> Shard:
-        """Return the outcome in the form in which it is stored."""
+        """Return the outcome as it is stored."""
         row: dict[str, Any] = {"reason": self.reason, "status": self.status}
         row |= {"wear": dict(self.wear), "wear_problem": self.wear_problem}
         arrays: dict[str, Any] = {f"column {name}": values for name, values in self.columns.items()}
@@ -126,7 +121,7 @@ class CohortWorker:
         self._frames, self._map_flexion, self._wear = frames, map_flexion, wear
 
     def __call__(self, number: int, run: CohortRun) -> Outcome:
-        """Return the results of a run, as `tkamb run` computes them. A failed run has a reason."""
+        """Return the results of a run, as `tkamb run` computes them, or why it failed."""
         try:
             return self._outcome(run)
         finally:
@@ -226,7 +221,6 @@ class Group:
 
     Args:
         labels: axis of the cohort -> label that the runs share.
-        axis: column that is divided into bins, "flexion_deg" or "cycle_percent".
         edges: edges of the b bins, in the unit of the axis, shape (b + 1,).
         bins: column -> mean of each run in each bin, shape (r, b); NaN for a bin without frames.
         peaks: column -> largest value of each run, shape (r,).
@@ -255,12 +249,10 @@ class Group:
 
 @dataclass(frozen=True, eq=False)
 class Spread:
-    """Statistics of a quantity over the runs of a group. The arrays have the shape of the quantity.
+    """Statistics of a quantity over the runs of a group, in the quantity's shape.
 
     Args:
         sd: standard deviation with n - 1; NaN for fewer than two runs.
-        low: smallest value.
-        high: largest value.
     """
 
     runs: Array
@@ -330,7 +322,7 @@ def _group(
 def _computed(outcome: Outcome) -> dict[str, Array]:
     """Return the columns of a run with NaN in failed frames, except for time and the bin axes.
 
-    The recorded motion of a failed frame must not be averaged with a solved one.
+    A failed frame's recorded motion must not be averaged with a solved one.
     """
     failures = np.array([status.startswith(FAILED) for status in outcome.status], bool)
     return {
@@ -340,7 +332,7 @@ def _computed(outcome: Outcome) -> dict[str, Array]:
 
 
 def _bin_indices(values: Array, axis: str, width: float) -> NDArray[np.int64]:
-    """Return the bin number of each frame. 100 % of the cycle belongs to the last bin."""
+    """Return the bin number of each frame; 100 % of the cycle is in the last bin."""
     result = np.floor(values / width + BIN_TOLERANCE).astype(int)
     end = axis == CYCLE and np.isclose(values, WHOLE_CYCLE, rtol=0, atol=BIN_TOLERANCE * width)
     return np.where(end, result - 1, result)

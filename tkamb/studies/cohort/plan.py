@@ -1,7 +1,7 @@
 """The cohort file: subjects, trials, designs and contact models, and the runs that they define.
 
-The cohort file is a TOML file. Its paths are relative to its folder, and an unknown key is an
-error. Every run is the scene of a trial with overrides, like those of `tkamb run --set`.
+It is a TOML file with paths relative to its folder, and an unknown key is an error. Every run is
+the scene of a trial with overrides, like those of `tkamb run --set`.
 """
 
 import hashlib
@@ -29,7 +29,7 @@ from tkamb.run.simulation import frames_slice
 AXES = ("subject", "trial", "design", "contact")
 GROUP_AXES = ("activity", *AXES[1:])
 MOST_RUNS = 20_000
-"""Largest number of runs. Reading a scene takes 5 ms and a run takes a minute."""
+"""Largest number of runs; reading a scene takes 5 ms and a run a minute."""
 Name = Annotated[str, Field(pattern=r"^[\w .+-]{1,60}$")]
 Overrides = Annotated[
     dict[str, Any],
@@ -94,7 +94,7 @@ class ContactModelTable(SceneTable):
 class CohortWearTable(SceneTable):
     """Wear of the insert of every run under the motion of that run.
 
-    The closing of the cycle, the wear material and the wear law are those of [wear] in the scene.
+    Closing of the cycle, material and law are those of [wear] in the scene.
     """
 
     cycles: Annotated[Count, Field(ge=1, le=10**9)] = 1_000_000
@@ -107,7 +107,7 @@ class CohortWearTable(SceneTable):
 class CohortTable(SceneTable):
     """The cohort file.
 
-    Its axes are subject, trial, design and contact. An axis without entries changes nothing.
+    Its axes are subject, trial, design and contact; one without entries changes nothing.
     """
 
     title: str = "Cohort"
@@ -160,7 +160,7 @@ class CohortRun:
     """One run of a cohort.
 
     Args:
-        number: number of the run in the table of runs, from 0.
+        number: number in the table of runs, from 0.
         labels: "subject", "trial", "activity", "design", "contact" -> name; "" for an axis without
             entries.
         overrides: dotted key of the scene -> value.
@@ -230,7 +230,7 @@ class Cohort:
 
 
 def load_cohort(path: str | Path, frames: str | None = None) -> Cohort:
-    """Read a cohort file and the scene of every run. Meshes and recordings are not opened."""
+    """Read a cohort file and the scenes of its runs, but no meshes and recordings."""
     path = Path(path)
     content = read_toml(path, what="cohort file")
     if frames is not None:
@@ -328,7 +328,7 @@ def _complaint(error: ValidationError, path: Path) -> InputError:
 
 
 def _keys_beside(location: tuple[int | str, ...]) -> list[str]:
-    """Return the keys that are allowed in the table where an unknown key stands."""
+    """Return the keys allowed beside an unknown one."""
     tables: dict[int | str, type[SceneTable]] = {
         "subject": SubjectTable,
         "trial": TrialTable,

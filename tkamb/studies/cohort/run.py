@@ -1,7 +1,7 @@
 """Computation of a cohort, from its file to the written results.
 
-Workers compute the runs. Each finished run is stored immediately. At the end the table of all
-frames, runs.csv, groups.csv, cohort.json and the report are written together.
+Workers compute the runs, each of which is stored at once; at the end the table of all frames,
+runs.csv, groups.csv, cohort.json and the report are written together.
 """
 
 import json
@@ -87,8 +87,8 @@ def frame_table(
 ) -> pa.Table:
     """Return the table of the frames of all successful runs, with one row per frame.
 
-    The first columns are the labels and the provenance of the run (`PROVENANCE`). They are followed
-    by the columns of results.csv that at least one run has, null for the other runs.
+    Labels and provenance of the run (`PROVENANCE`) come first, then the columns of results.csv that
+    a run has, null for the others.
     """
     successful = {n: outcome for n, outcome in outcomes.items() if not outcome.reason}
     present = dict.fromkeys(name for outcome in successful.values() for name in outcome.columns)
@@ -163,10 +163,9 @@ MOST_SHARDS = 10_000
 
 @dataclass(frozen=True)
 class Part:
-    """Part of a cohort's runs that one job of a batch queue computes.
-
-    Args:
-        index: number of the part, from 1 to `count`.
+    """Args:
+    index: number of the part of the runs, from 1 to `count`, that one job of a batch queue
+        computes.
     """
 
     index: int
@@ -182,11 +181,11 @@ class Part:
 
     @property
     def folder(self) -> str:
-        """Return the name of the part's folder inside the folder of the cohort."""
+        """Return the part's folder inside that of the cohort."""
         return SHARD_NAME.format(self.index, self.count)
 
     def holds(self, number: int) -> bool:
-        """Return whether a run belongs to the part. Every `count`-th run does."""
+        """Return whether a run, every `count`-th, belongs to the part."""
         return number % self.count == self.index - 1
 
 
@@ -272,7 +271,7 @@ def _parts(directory: Path, part: Part | None, resume: bool) -> Iterator[list[Pa
 
 
 def _holds_parts_alone(directory: Path) -> bool:
-    """Return whether a folder contains only folders of parts of a cohort, and at least one."""
+    """Return whether a folder contains only folders of a cohort's parts."""
     entries = list(directory.iterdir()) if os.path.isdir(directory) else []
     named = all(entry.match(SHARD_NAME.format("*", "*")) for entry in entries)
     return bool(entries) and named and all(is_ours(entry) for entry in entries)

@@ -74,13 +74,10 @@ class Articulation:
     def touch(
         self, ap: float, ml: float, axial_rotation: float, flexion: float, guess: float = 0.0
     ) -> TouchingPose:
-        """Return the pose at which both condyles touch.
+        """Return the pose at which both condyles touch, at an AP and ML position, mm, and angles,
+        rad.
 
         Args:
-            ap: AP position, mm.
-            ml: ML position, mm.
-            axial_rotation: axial rotation, rad.
-            flexion: flexion, rad.
             guess: initial guess of the adduction, rad.
         """
 
@@ -112,7 +109,6 @@ class Design:
     """One implant.
 
     Args:
-        bearing: "fixed" or "mobile".
         symmetric: whether both condyles have the same J-curve.
         articulation: femoral component and insert, mm.
         sources: group of dimensions -> its source.
@@ -136,10 +132,7 @@ class Design:
         return self.articulation.insert
 
     def write_meshes(self, folder: Path) -> tuple[Path, ...]:
-        """Write the parts as binary STL files in mm and return the paths.
-
-        A femoral component with a cam is written with and without it.
-        """
+        """Write the parts as binary STL files, mm, with and without a cam, and return the paths."""
         folder.mkdir(parents=True, exist_ok=True)
         meshes = {
             FEMORAL_MESH: self.femoral.mesh(),

@@ -1,7 +1,7 @@
 """An insert: a height field with two dishes over a kidney-shaped outline, flat below.
 
 Each dish is a coronal arc moved along a sagittal arc, so both curvatures are exact at its lowest
-line. The eminence between the dishes is an arc that is tangent to both. A post is optional.
+line; the eminence between is an arc tangent to both.
 """
 
 from dataclasses import dataclass
@@ -35,9 +35,8 @@ class Post:
     draft: float = 2.0
 
     def rise(self, x: ArrayLike, z: ArrayLike) -> Array:
-        """Return the height (...) of the post above the lowest points of the dishes; 0 outside.
-
-        The outline is a rectangle with rounded corners.
+        """Return the height (...) above the lowest points of the dishes; 0 outside a rectangle with
+        rounded corners.
         """
         half = np.array([(self.anterior - self.posterior) / 2.0, self.half_width])
         middle = (self.anterior + self.posterior) / 2.0
@@ -62,7 +61,6 @@ class Insert:
         dish_half: ML distance of the lowest lines of the dishes from the middle.
         eminence_height: height of the eminence above the lowest points of the dishes.
         notch_width: half the ML width of the notch where its depth has fallen to 37 %.
-        post: posterior-stabilising post; None: no post.
     """
 
     medial_dish_radii: tuple[float, float]
@@ -143,9 +141,8 @@ class Insert:
         return np.asarray(np.where(u < tangent, hill, dish))
 
     def _outline(self) -> tuple[Array, Array, Array]:
-        """Return z, and x of the posterior and anterior edge at each z, each of shape (n,).
-
-        z is finer at the rounded ends. The outline is centred in x.
+        """Return z, finer at the rounded ends, and x of both edges at each z, (n,), centred in
+        x.
         """
         inner = np.linspace(0.0, self.width_half - 4.0, 49)
         turn = np.sin(np.radians(np.linspace(0.0, 90.0, 13)))[1:]

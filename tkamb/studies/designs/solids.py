@@ -12,7 +12,7 @@ from tkamb.geometry.frames import Array
 Ids = NDArray[np.int64]
 Node = tuple[int, int]
 HEADER = b"tkamb deep knee bend, millimetres".ljust(80)
-"""Header of every STL file. It stays the same so that equal meshes give equal files."""
+"""Header of every STL file, constant so that equal meshes give equal files."""
 
 
 def close_sheets(
@@ -56,7 +56,7 @@ def close_sheets(
 
 
 def _ids(rows: int, columns: int, fork: int | None, start: int) -> Ids:
-    """Return the vertex number of every grid node. Up to the fork the middle columns share one."""
+    """Return the vertex of every grid node; up to the fork the middle columns share one."""
     ids = start + np.arange(rows * columns).reshape(rows, columns)
     if fork is not None:
         ids[: fork + 1, columns // 2] = ids[: fork + 1, columns // 2 - 1]
@@ -64,7 +64,7 @@ def _ids(rows: int, columns: int, fork: int | None, start: int) -> Ids:
 
 
 def _sheet(ids: Ids, rows: Ids, columns: Ids, middle: int | None) -> Ids:
-    """Return the triangles of a grid, with a gap between the column `middle` and the next."""
+    """Return a grid's triangles, with a gap between `middle` and the next column."""
     pairs = [(a, b) for a, b in pairwise(columns) if a != middle]
     first, right = np.array(pairs).T
     up, down = rows[:-1, None], rows[1:, None]
@@ -89,7 +89,7 @@ def _loop(rows: list[int], columns: list[int], fork: int | None) -> list[Node]:
 
 
 def _wall(top: Ids, bottom: Ids, coarse_grid: tuple[Ids, Ids], fork: int | None) -> Ids:
-    """Return the triangles between the edges of the full outer and the coarse inner sheet."""
+    """Return the triangles between the edges of both sheets."""
     fine = _loop(list(range(top.shape[0])), list(range(top.shape[1])), fork)
     coarse = set(_loop(coarse_grid[0].tolist(), coarse_grid[1].tolist(), fork))
     stations = [i for i, node in enumerate(fine) if node in coarse]

@@ -1,7 +1,7 @@
 """An uncertainty analysis, from a scene to the written bands.
 
-Workers compute the samples. Each finished sample is stored immediately, so that an interrupted
-analysis can be resumed. The samples give bands, tornado table and optional Sobol' indices.
+Workers compute the samples, each of which is stored at once, so that an interrupted analysis can be
+resumed. The samples give bands, tornado table and optional Sobol' indices.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -120,7 +120,7 @@ TORNADO_RESULTS = (
     *("medial_peak_pressure_MPa", "lateral_peak_pressure_MPa", "quadriceps_N"),
 )
 PEAK = "force_total_BW"
-"""Column of which the summary gives the peak and its band."""
+"""Column whose peak and band the summary gives."""
 NO_BAND = (
     *("time_s", "cycle_percent", "iterations", "coupling_iterations", "coupling_change_N"),
     *("coupling_change_mm", "contact_trials", "split_determined", "condition_number"),
@@ -253,7 +253,7 @@ def _points(method: str, samples: int, dimensions: int, seed: int, crossed: bool
 
 @dataclass(frozen=True, eq=False)
 class _Job:
-    """The samples of one scene. `crossed` is the number of rows of Saltelli's design, or 0."""
+    """The samples of one scene, with `crossed` rows of Saltelli's design, or 0."""
 
     case: Case
     nominal: Results
@@ -266,7 +266,7 @@ class _Job:
 
     @property
     def design(self) -> str:
-        """Return the sampling method. With Saltelli's design it includes the number of rows."""
+        """Return the sampling method, with the number of rows of Saltelli's design."""
         return (
             f"{self.method}, Saltelli's design of {self.crossed}" if self.crossed else self.method
         )
@@ -337,7 +337,7 @@ class _Job:
 
 
 def shares_of_variance(tornado: Sequence[Influence]) -> dict[str, dict[str, float]]:
-    """Return result -> input -> its share of the variance of the result, largest first."""
+    """Return result -> input -> its share of the variance, largest first."""
     rows: dict[str, dict[str, float]] = {}
     for row in tornado:
         rows.setdefault(row.result, {})[row.name] = row.share

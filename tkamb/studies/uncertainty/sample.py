@@ -1,8 +1,7 @@
 """One sample of a scene: inputs with errors, and the results as one array.
 
-The errors are applied to the loaded case, in SI units and for a right knee, so no file is read
-again. Meshes, search trees and the prepared contact are those of the nominal scene. Only a varied
-modulus of the insert needs a new preparation of the contact.
+Errors are applied to the loaded case, in SI units and for a right knee: only a varied modulus of
+the insert needs a new preparation of the contact.
 
 Each skin marker is displaced on its segment by an error that is constant over the frames. The rigid
 fit of the displaced markers to the nominal ones is the error of the segment's pose
@@ -67,9 +66,8 @@ if TYPE_CHECKING:
 
 
 def varied_case(case: Case, draw: Draw) -> Case:
-    """Return the case with varied inputs. Velocities and accelerations are those of the recording.
-
-    A case contains neither the insert's modulus nor the shared muscles. `Sampler` varies these.
+    """Return the case with varied inputs but the insert's modulus and shared muscles, which it does
+    not contain. Velocities and accelerations are those of the recording.
     """
     tibia, coordinates = displaced_by_markers(case, draw)
     varied = replace(case, tibia=tibia, motion=replace(case.motion, coordinates=coordinates))
@@ -98,9 +96,8 @@ def varied_case(case: Case, draw: Draw) -> Case:
 
 
 def _shank_error(case: Case, draw: Draw) -> Array:
-    """Return the pose (4, 4) of the erroneous shank in the nominal one.
-
-    The shank turns about AP through the knee's centre, the origin of the insert, and moves.
+    """Return the pose (4, 4) of the erroneous shank in the nominal one: it turns about AP through
+    the insert's origin, and moves.
     """
     tilt, centre = draw.error("frontal_alignment"), case.chain.insert_in_tibia[:3, 3]
     rotation = Rotation.from_rotvec([tilt, 0.0, 0.0]).as_matrix()
@@ -212,7 +209,7 @@ def varied_muscles(muscles: SharedMuscles | None, draw: Draw) -> SharedMuscles |
 
 
 def _on_femur(case: Case, end: LinkPoint, draw: Draw) -> LinkPoint:
-    """Return a point, moved by the error of the femoral placement if it belongs to the femur."""
+    """Return a point, moved with the femoral component if it is on the femur."""
     shift = draw.place("femoral_placement")
     if not shift.any() or case.chain.carrier(end.link) != "femur":
         return end
@@ -221,7 +218,7 @@ def _on_femur(case: Case, end: LinkPoint, draw: Draw) -> LinkPoint:
 
 
 def _wrap_on_femur(case: Case, wrap: WrapObject, draw: Draw) -> WrapObject:
-    """Return a ligament's surface, moved as `_on_femur` moves its centre."""
+    """Return a ligament's surface, whose centre moves as in `_on_femur`."""
     centre = _on_femur(case, LinkPoint(wrap.body, wrap.pose[:3, 3]), draw).position
     return replace(wrap, pose=pose(wrap.pose[:3, :3], centre))
 
@@ -229,8 +226,7 @@ def _wrap_on_femur(case: Case, wrap: WrapObject, draw: Draw) -> WrapObject:
 def thinnable(case: Case) -> bool:
     """Return whether each frame can be computed without the other frames of the motion.
 
-    A solved patella needs them for its derivatives in time. A reference strain needs the frame to
-    which it refers.
+    A solved patella needs them for its derivatives, a reference strain for its frame.
     """
     solved = case.scene.patella is not None and case.scene.patella.motion == "solved"
     bundles = (*case.ligaments, *case.patella_ligaments)
@@ -261,9 +257,8 @@ def thinned(case: Case, frames: range) -> Case:
 
 
 def displaced_by_markers(case: Case, draw: Draw) -> "tuple[BodyMotion | None, Array]":
-    """Return shank motion and knee coordinates (f, 6) with the errors of the markers.
-
-    Only coordinates that are computed from the markers change.
+    """Return shank motion and knee coordinates (f, 6) with the errors of markers, as far as these
+    give them.
     """
     markers, tibia, coordinates = case.scene.motion.markers, case.tibia, case.motion.coordinates
     if (
@@ -285,7 +280,7 @@ def displaced_by_markers(case: Case, draw: Draw) -> "tuple[BodyMotion | None, Ar
 
 
 def _fit_error(segment: MarkerSegmentTable, draw: Draw, is_left: bool) -> Array:
-    """Return the pose (4, 4) of the fitted segment in the nominal one, mirrored to a right leg."""
+    """Return the pose (4, 4) of the fitted segment in the nominal one, of a right leg."""
     points = np.array(list(segment.markers_mm.values())) * MILLIMETRE
     points = points @ MIRROR if is_left else points
     errors = np.array([draw.place(f"marker.{label}") for label in segment.markers_mm])
@@ -354,11 +349,8 @@ class Sampler:
         return Draw(self.inputs, self._root @ point.normal, noise, table.constant_share)
 
     def __call__(self, number: int, point: Point) -> Sample:
-        """Return the sample at a point. Each frame has a warm start from the preceding frame.
-
-        Args:
-            number: number of the sample, which has no effect.
-            point: point of the sample in the space of the inputs.
+        """Return the sample at a point, whatever its number. Each frame has a warm start from the
+        preceding frame.
         """
         draw = self.draw(point)
         errors = draw.standardised()[list(self._frames)]
@@ -399,7 +391,7 @@ class Sampler:
 
 
 class BandWorker:
-    """Computes samples in a worker. It can be prepared before the column names are known."""
+    """Computes samples in a worker, which can be prepared before the column names are known."""
 
     def __init__(self, scene: Scene, frames: range) -> None:
         self._scene, self._frames = scene, frames
@@ -408,7 +400,7 @@ class BandWorker:
             self._sampler = Sampler(scene, frames, ())
 
     def __call__(self, number: int, job: tuple[Point, list[str]]) -> Sample:
-        """Return the sample of a job, which is a point and the names of the columns."""
+        """Return the sample of a job: a point and the names of the columns."""
         point, names = job
         sampler = self._sampler or Sampler(self._scene, self._frames, names)
         sampler.names = names
@@ -418,9 +410,9 @@ class BandWorker:
 def _frame(
     case: Case, recording: Recording, k: int, before: list[FrameStart]
 ) -> tuple[dict[str, Any], str]:
-    """Return the row of frame k in results.csv, and the reason if it failed.
+    """Return frame k's row in results.csv, and the reason if it failed.
 
-    `before` holds the starts of the last two frames and is updated.
+    `before`, the last two starts, is updated.
     """
     frame = recording.frame(k, before)
     before.append(frame.next)

@@ -1,7 +1,5 @@
-"""Sensitivity of the results to the inputs: Sobol' indices and screening.
-
-The indices come from Saltelli's design. Screening changes one input at a time by plus and minus one
-standard deviation.
+"""Sensitivity of the results to the inputs: Sobol' indices by Saltelli's design, and screening by
+one input at a time, plus and minus one standard deviation.
 """
 
 from collections.abc import Sequence
@@ -29,9 +27,8 @@ class SobolIndex:
 
     Args:
         first: first-order index, the share of the input alone: Var(E(y | x_i)) / Var(y).
-        first_error: standard error of the first-order index.
-        total: total index, which includes all interactions: E(Var(y | all but x_i)) / Var(y).
-        total_error: standard error of the total index.
+        total: total index, which includes all interactions: E(Var(y | all but x_i)) / Var(y). Both
+            have standard errors.
         rows: number of rows of the design that were used.
     """
 
@@ -209,8 +206,8 @@ def _of_result(
 def screen_lines(rows: Sequence[Screened], width: int = 20) -> list[str]:
     """Return the lines of the printed tornado table, with a bar for each input.
 
-    Inputs with less than `LEAST_SHARE` of the largest change are counted in one line.
-    `rows` come from `screen`; `width` is the length of the longest bar in characters.
+    Inputs below `LEAST_SHARE` of the largest change are counted in one line. `rows` come from
+    `screen`; the longest bar has `width` characters.
     """
     lines: list[str] = []
     names = max((len(_named(row)) for row in rows), default=0)

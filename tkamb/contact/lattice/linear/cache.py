@@ -1,21 +1,19 @@
 """Cache of prepared operators on disk.
 
 The key of a file is the SHA-256 of everything that its operator depends on: nodes, cells, held
-unknowns, contact nodes, elastic constants, kind of solid, and tkamb's own code. A file is a
-NumPy archive (.npz, not compressed) of the key and the operator's arrays. Each array has a CRC-32.
-A file is written under a temporary name and then renamed, so that other processes never read half
-a file. It is read into memory: a file that is cut short while it is in use does no harm.
+unknowns, contact nodes, elastic constants, kind of solid, and tkamb's own code. A file is a NumPy
+archive (.npz, not compressed) of the key and the operator's arrays. Each array has a CRC-32. A file
+is written under a temporary name and then renamed, so that other processes never read half a file.
+It is read into memory: one that is cut short in use does no harm.
 
 A file is used only if
 - it is a regular file of this user, and nobody else may write it;
 - key and checksums are right;
 - its operator inverts the stiffness of the solid (`operator_error`).
-Otherwise the operator is computed again, with one notice. After a file is written, half-written
-files of killed processes are removed. If the folder then exceeds its limit, the least recently used
-files are removed too.
+Otherwise the operator is computed again, with one notice. After a write, half-written files of
+killed processes are removed, and, if the folder exceeds its limit, the least recently used files.
 
-The folder is $TKAMB_CACHE_DIR, else $XDG_CACHE_HOME/tkamb, else ~/.cache/tkamb. Small operators,
-which take two seconds or less, are not stored.
+The folder is $TKAMB_CACHE_DIR, else $XDG_CACHE_HOME/tkamb, else ~/.cache/tkamb.
 """
 
 import hashlib
@@ -51,8 +49,7 @@ class FactorCacheSettings:
     """Unknowns: smaller operators are not stored. Factorising them takes two seconds
     or less."""
     size_limit: float = 6e9
-    """Bytes: largest size of the folder. The least recently used files are removed first.
-    It is a small part of a usual disk."""
+    """Bytes: largest size of the folder, a small part of a usual disk."""
     largest_error: float = 2e-3
     """1: largest relative error of a stored operator (`operator_error`). Rounding to
     16 bits causes 5e-4 for every Poisson's ratio and bearing; four times as much means a damaged
@@ -103,11 +100,7 @@ def cached_operator(
     If the folder cannot be written, the operator is computed each time.
 
     Args:
-        solid: cells and material.
-        fixed: mask of the held unknowns, shape (3n,).
-        contact_nodes: nodes of the contact surface, shape (c,).
         make: function that computes the operator.
-        coarse: whether its factor is stored in 16-bit integers.
         limit: largest size of the folder, bytes; a larger operator is not stored.
     """
     if int((~fixed).sum()) < FACTOR_CACHE.least_unknowns:
@@ -135,12 +128,6 @@ def check_operator(
     operator: ElasticOperator, solid: Solid, fixed: Mask, contact_nodes: Index
 ) -> None:
     """Check that a stored operator belongs to the solid.
-
-    Args:
-        operator: the stored operator.
-        solid: cells and material.
-        fixed: mask of the held unknowns, shape (3n,).
-        contact_nodes: nodes of the contact surface, shape (c,).
 
     Raises:
         InputError: the operator has other unknowns, or does not invert the stiffness.

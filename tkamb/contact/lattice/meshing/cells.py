@@ -1,6 +1,6 @@
 """Cells of eight nodes: corners, springs, quality and shape functions.
 
-Corners are in VTK hexahedron order. The cell's axes i, j, k are along x, y, z.
+Corners are in VTK hexahedron order, with the axes i, j, k along x, y, z.
 """
 
 from dataclasses import dataclass
@@ -34,12 +34,11 @@ NEIGHBOURS = np.array(
 """Number of the corner at the other end of each corner's edge along x, y and z, (8, 3)."""
 
 PAIRS = np.array([(a, b) for a in range(8) for b in range(a + 1, 8)])
-"""The 28 pairs of a cell's corners that are joined by springs."""
+"""The 28 pairs of corners that springs join."""
 
 PAIR_AXES = np.abs(np.diff(CORNERS[PAIRS], axis=1))[:, 0]
-"""Axes along which the corners of each pair differ, 0 or 1, (28, 3).
-
-The sum of a row is 1 for an edge, 2 for a face diagonal and 3 for a body diagonal.
+"""Axes along which a pair's corners differ, 0 or 1, (28, 3): one for an edge, two for a face
+diagonal, three for a body diagonal.
 """
 
 _GAUSS = 0.5 + (CORNERS - 0.5) / np.sqrt(3.0)
@@ -69,7 +68,7 @@ FAMILY_SHARE = np.array([0.25] * 3 + [0.5] * 6 + [1.0] * 4)
 FACES = np.array(
     [[0, 3, 7, 4], [1, 2, 6, 5], [0, 1, 5, 4], [3, 2, 6, 7], [0, 1, 2, 3], [4, 5, 6, 7]]
 )
-"""Corners of the six faces: -x, +x, -y, +y, -z, +z."""
+"""Corners of the faces -x, +x, -y, +y, -z, +z."""
 
 
 EDGES = np.array(
@@ -81,7 +80,7 @@ EDGES = np.array(
         if (CORNERS[b] - CORNERS[a]).tolist() == np.eye(3, dtype=int)[axis].tolist()
     ]
 )
-"""The 12 edges of a cell as pairs of corners: four along x, four along y, four along z."""
+"""The 12 edges as pairs of corners, four along each of x, y, z."""
 
 
 @dataclass(frozen=True, eq=False)

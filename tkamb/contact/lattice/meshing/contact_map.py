@@ -21,7 +21,7 @@ ON_MESH_DISTANCE = 1e-6
 
 
 GAUSS_POINTS = 0.5 + np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / (2 * np.sqrt(3.0))
-"""The 2 x 2 Gauss points of a face, in [0, 1]². Their weights are equal."""
+"""The 2 x 2 Gauss points of a face, in [0, 1]², with equal weights."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +61,7 @@ def contact_map(lattice: Lattice, insert: Surface) -> tuple[Index, ContactMap]:
 def contact_squares(triangles: Index) -> Index:
     """Return the cell faces (k/2, 4) of the contact triangles (k, 3) of a `Lattice`.
 
-    Triangles i and i + k/2 are the two halves of face i. They share the face's first and third
-    corner.
+    Triangles i and i + k/2 are the halves of face i, with its first and third corner.
     """
     first, second = np.split(triangles, 2)
     if not np.array_equal(first[:, [0, 2]], second[:, [0, 1]]):
@@ -77,9 +76,9 @@ def consistent_areas(points: Array, squares: Index) -> Array:
 
         A_i = sum over faces of the integral of N_i dA
 
-    A uniform pressure p has the consistent nodal forces p A_i, so that force over area is p at
-    every node, also at corners, oblique outlines and faces that are almost triangles. Equal shares
-    of the triangles would depend on the faces' diagonals.
+    A uniform pressure p has the consistent nodal forces p A_i: force over area is p at every node,
+    also at corners, oblique outlines and near-triangles, while equal shares of the triangles would
+    depend on the diagonals.
 
     Points (n, 3) are in m, squares (m, 4) the nodes around each face.
 
@@ -99,7 +98,7 @@ def consistent_areas(points: Array, squares: Index) -> Array:
 
 
 def _thickness(points: Array, rays: RayCaster, spacing: Array) -> Array:
-    """Return the thickness of the insert below each point, m, including voids."""
+    """Return the insert's thickness below points, m, with voids."""
     inside = points - [0.0, 1e-3 * spacing[1], 0.0]
     distance = rays.last_exit(inside, (0.0, -1.0, 0.0))
     to_lowest = points[:, 1] - rays.surface.bounds[0, 1]

@@ -48,7 +48,7 @@ OUTER_SKIN_TURNED = (0, 3, 4)
 
 
 def connected_pieces(cells: Index) -> Index:
-    """Return the piece (c,) of each cell (c, 8). The cells of a piece are joined by whole faces."""
+    """Return the piece (c,) of each cell (c, 8); whole faces join its cells."""
     face, joined = _sorted_faces(cells)
     a, b = face[:-1][joined] // len(FACES), face[1:][joined] // len(FACES)
     graph = coo_array((np.ones(len(a), bool), (a, b)), shape=(len(cells), len(cells)))
@@ -56,10 +56,10 @@ def connected_pieces(cells: Index) -> Index:
 
 
 def standing_pieces(cells: Index, bottom: Mask) -> Mask:
-    """Return the mask (c,) of the cells of large pieces that stand on the bottom.
+    """Return whether cells (c,) are in large pieces that stand on the bottom.
 
-    Any other piece has no fixed node, and its stiffness is singular. If no piece stands on the
-    nodes `bottom` (n,), the largest one is kept.
+    Any other piece has no fixed node and a singular stiffness. If no piece stands on the nodes
+    `bottom` (n,), the largest one is kept.
     """
     if not len(cells):
         return np.ones(0, bool)
@@ -90,7 +90,7 @@ class MissingPart:
 def missing_part(nodes: Array, cells: Index, spacing: Array, insert: Surface) -> MissingPart | None:
     """Return the largest connected part of the mesh outside of all cells; None if there is none.
 
-    The search uses a grid of points with half the lattice's `spacing` (3,), m.
+    The search grid has half the lattice's `spacing` (3,), m.
     """
     step = spacing / 2.0
     lines = [
@@ -123,7 +123,7 @@ def outer_skin(nodes: Array, cells: Index) -> Surface:
 
 
 def solid_volume(insert: Surface, centres: Array) -> float:
-    """Return the volume of the mesh's bodies, m³. Where bodies overlap, it counts once.
+    """Return the volume of the mesh's bodies, m³; overlaps count once.
 
     `centres` (c, 3), m, are points throughout the bodies, a few per cubic millimetre.
     """
@@ -142,10 +142,10 @@ def volume_error(nodes: Array, cells: Index, insert: Surface) -> float:
 
 
 def _sorted_faces(cells: Index) -> tuple[Index, Mask]:
-    """Return the faces of all cells, with the two copies of an inner face next to each other.
+    """Return the faces of all cells, the two copies of an inner face next to each other.
 
     The smallest and the largest node identify a face of a grid. Each is 6 cell + row of `FACES`,
-    (6c,); also returns whether it is the same face as the next one, (6c - 1,).
+    (6c,); whether it is the same as the next one, (6c - 1,).
     """
     ends = np.sort(cells[:, FACES].reshape(-1, 4), axis=1)[:, [0, 3]]
     order = np.lexsort((ends[:, 1], ends[:, 0]))
@@ -189,12 +189,11 @@ class Lattice:
         origin: position of the grid's node (0, 0, 0), m, (3,).
         cells: nodes of the cells in the order of VTK's hexahedron, (c, 8).
         contact_triangles: nodes of outward triangles over the contact nodes, (k, 3).
-        dropped_nodes: number of omitted nodes, which belong to no cell.
-        dropped_cells: number of omitted cells (inverted, across a gap, or in a loose piece).
+        dropped_nodes: number of omitted nodes, which belong to no cell. The omitted cells
+            (`dropped_cells`) are inverted, across a gap, or in a loose piece.
         mended_rays: number of vertical lines with crossings corrected from their neighbours.
         closed_gaps: number of filled gaps, narrower than a cell.
         thin_intervals: number of intervals thinner than half a cell, with one node.
-        size_notices: notices about the cells' size, in words.
     """
 
     nodes: Array
@@ -226,12 +225,12 @@ class Lattice:
 
     @cached_property
     def springs(self) -> Springs:
-        """Springs between the nodes of each cell, each spring once."""
+        """Springs between the nodes of each cell, each once."""
         return join_springs(self.cells, len(self.nodes))
 
     @cached_property
     def piece_of_node(self) -> Index:
-        """Number (n,) of each node's piece; two pieces share no cell face."""
+        """Number (n,) of each node's piece; pieces share no cell face."""
         piece = np.zeros(len(self.nodes), np.int64)
         piece[self.cells] = connected_pieces(self.cells)[:, None]
         return piece
@@ -342,7 +341,7 @@ def _all_corners(member: Mask) -> Mask:
 
 
 def _bridges_gap(field: NodeField, cells: Index) -> Mask:
-    """Return the mask of cells with a vertical edge between different intervals of a line."""
+    """Return cells with a vertical edge between different intervals of a line."""
     number = field.interval.ravel()[cells]
     low, high = number[:, [0, 1, 4, 5]], number[:, [3, 2, 7, 6]]
     return ((low >= 0) & (high >= 0) & (low != high)).any(axis=1)
@@ -373,7 +372,7 @@ def _assemble(field: NodeField, cells: Index, dropped_cells: int) -> Lattice:
 
 
 def _classes(field: NodeField, cells: Index) -> NDArray[np.int8]:
-    """Return the class of every node of the flattened grid. Inner nodes belong to 8 cells."""
+    """Return the class of every node; inner nodes belong to 8 cells."""
     on_surface = np.bincount(cells.ravel(), minlength=field.member.size) < 8
     result = np.where(on_surface, OTHER, INTERNAL).astype(np.int8)
     result[field.top.ravel()] = CONTACT
@@ -388,7 +387,7 @@ def _on_bottom(field: NodeField) -> Mask:
 
 
 def _contact_triangles(index: Index, node_class: NDArray[np.int8], shape: tuple) -> Index:
-    """Return outward triangles over squares of contact columns that differ by at most one layer."""
+    """Return outward triangles over contact columns at most one layer apart."""
     number = np.full((shape[0], shape[2]), -1)
     height = np.zeros((shape[0], shape[2]), np.int64)
     contact = np.flatnonzero(node_class == CONTACT)

@@ -1,7 +1,7 @@
 """The quality of a lattice: volume, edges, corners, shear and corrections.
 
-A lattice can lose features thinner than a cell, and parts of a faulty mesh, which results of a
-contact do not show. So `whole_lattice` rejects a lattice whose volume differs by more than 2 %.
+It can lose features thinner than a cell, and parts of a faulty mesh, which a contact does not show:
+`whole_lattice` rejects a volume that differs by more than 2 %.
 """
 
 import logging
@@ -41,9 +41,9 @@ BEYOND_REFINEMENT = 0.1
 def whole_lattice(insert: Surface, target_size: float) -> Lattice:
     """Return the lattice of a closed insert, with the volume of the mesh within 2 %.
 
-    If cells of the desired size change it by more, somewhat smaller ones are used, with a notice:
-    the loss at thin rims varies with the size. The log "tkamb" has smaller cells, corrected rays,
-    and a post.
+    If the desired size changes it by more, somewhat smaller cells are used, with a notice: the loss
+    at thin rims varies with the size. The logger "tkamb" logs smaller cells, corrected rays, and a
+    post.
 
     Arguments as in `build_grid`.
 
@@ -163,7 +163,7 @@ def _edge_ratios(points: Array) -> Array:
 
 
 def _shear(points: Array) -> Array:
-    """Return the angle (c,), rad, between a cell's mean upright edge and its layer's normal."""
+    """Return (c,), rad, between a mean upright edge and its layer's normal."""
     edges = points[:, EDGES[:, 1]] - points[:, EDGES[:, 0]]
     along_x, upright, along_z = (edges[:, 4 * a : 4 * a + 4].mean(axis=1) for a in range(3))
     normal = np.cross(along_z, along_x)

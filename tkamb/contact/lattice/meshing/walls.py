@@ -1,11 +1,11 @@
 """Sideways moves of nodes onto walls, which vertical rays do not meet, and into notches.
 
-Walls: if a node has no cell beside it, a ray along x or z gives the distance of the wall. Within
-half a cell the node is moved onto it; otherwise the next node outside is moved inwards onto it.
+Walls: if a node has no cell beside it, a ray along x or z finds the wall: within half a cell the
+node is moved onto it, otherwise the next node outside is moved inwards onto it.
 
 Notches: a grid follows an oblique surface in steps, and each leaves a wedge that belongs to no
-cell. The node outside of the wedge is moved into the corner of the part, or, if the surface is
-straight there, almost onto the line between its two neighbours.
+cell. The node outside of it is moved into the corner of the part, or on a straight surface almost
+onto the line between its two neighbours.
 """
 
 from dataclasses import dataclass
@@ -84,7 +84,7 @@ class Notch:
 
 
 def _fill(field: NodeField, notch: Notch, before: Array, rays: RayCaster) -> None:
-    """Move the missing nodes into the corner of the part, or to the line between neighbours."""
+    """Move missing nodes into the corner of the part, or between their neighbours."""
     first, second, across = (field.points[n] for n in (notch.first, notch.second, notch.across))
     start, middle = before[notch.node], 0.5 * (first + second)
     flat = notch.axes == (0, 2)
@@ -117,17 +117,17 @@ def _fill(field: NodeField, notch: Notch, before: Array, rays: RayCaster) -> Non
 
 
 def _towards(point: Array, goal: Array, share: float, rise: Array | float) -> Array:
-    """Return points moved sideways by a share of the way to goals, and up by `rise`, m."""
+    """Return points moved sideways by a share of the way, and up by `rise`, m."""
     result = point + share * (goal - point)
     result[:, 1] = point[:, 1] + rise
     return result
 
 
 def _add_members(field: NodeField, notch: Notch, target: Array, usable: Mask, flat: bool) -> None:
-    """Make the usable nodes members at their target positions.
+    """Make the usable nodes members.
 
-    In a horizontal square, one between two top nodes becomes a top node; otherwise the forces on
-    the other nodes of its cell's upper face would be too large.
+    In a horizontal square, one between two top nodes becomes a top node; otherwise forces on the
+    other nodes of its cell's upper face would be too large.
     """
     rejected, added = (tuple(n[mask] for n in notch.node) for mask in (~usable, usable))
     field.upper_end[rejected] = field.lower_end[rejected] = False
@@ -176,7 +176,7 @@ def move_to_walls(field: NodeField, surface: Surface) -> None:
 
 
 def _firing_points(field: NodeField) -> Array:
-    """Return the points at which sideways rays begin; at ends of intervals they are inside."""
+    """Return where sideways rays begin: at ends of intervals inside."""
     result = field.points.copy()
     height = field.points[..., 1]
     for end, step in ((field.upper_end, -1), (field.lower_end, 1)):
@@ -209,7 +209,7 @@ def _filled_cells(field: NodeField, surface: Surface) -> Mask:
 def _walls_beside(
     field: NodeField, firing: Array, rays: RayCaster, surface: Surface
 ) -> list[WallHits]:
-    """Return the members without a cell and the distances of walls in each direction of STEPS."""
+    """Return the walls in each direction of STEPS."""
     cells = np.pad(_filled_cells(field, surface), 1)
     result = []
     for axis, sign in STEPS:
@@ -258,10 +258,9 @@ def _move_out(field: NodeField, firing: Array, hits: list[WallHits], rays: RayCa
 
 
 def _corner_or_wall(start: Array, move: Array, rays: RayCaster) -> Array:
-    """Return the new positions (n, 3), m, of nodes beside walls.
+    """Return new positions (n, 3), m; `move` is as in `_add_at`.
 
-    `move` is as in `_add_at`. With two walls, a node moves to their corner if this lies in the
-    part, else to its `_foot`.
+    Between two walls it is their corner if this lies in the part, else `_foot`.
     """
     move = move * (1.0 - WALL_INSET)
     corner = start.copy()
@@ -278,7 +277,7 @@ def _corner_or_wall(start: Array, move: Array, rays: RayCaster) -> Array:
 
 
 def _pull_in(field: NodeField, before: Array, hits: list[WallHits], rays: RayCaster) -> None:
-    """Move nodes outside of the part onto the wall between them and a member, and add them."""
+    """Move nodes outside of the part onto the wall before a member, and add them."""
     move = np.zeros((*field.member.shape, 2))
     upper, lower, top = (np.ones(field.member.shape, bool) for _ in range(3))
     height = np.full(field.member.shape, np.nan)
@@ -336,9 +335,9 @@ def _add_at(
 
 
 def _foot(move: Array) -> Array:
-    """Return the moves (n, 2), m, of nodes onto walls at `move` along x and z.
+    """Return the moves (n, 2), m, onto walls at `move` along x and z.
 
-    With two walls, a node moves to the foot of its perpendicular on the line through the hits.
+    Between two walls it is the foot of the perpendicular on the line through the hits.
     """
     move = move * (1.0 + WALL_INSET)
     with_two_walls = (move != 0.0).all(axis=1)
