@@ -1,5 +1,6 @@
 """Derivatives of the knee's forces, of dynamics with them, of presses and of equilibria."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +23,9 @@ from knee_bodies import whole_body
 from test_knee import FOUNDATION, SCENE, at, pressed
 from tkamb.contact import foundation, pressing
 from tkamb.errors import InputError
+from tkamb.geometry.frames import displaced
 from tkamb.knee import balance, released
+from tkamb.knee.solution_derivatives import moved_contact
 
 STATES, SLOW = 50, {"lattice", "fe"}
 """Number of random states; cases whose contact takes a second per pose."""
@@ -206,3 +209,24 @@ def test_an_equilibrium(read, monkeypatch):
             slope = (ends[0] - ends[1]) / (2.0 * step * value)
             scale = np.abs(slope)
             assert columns[:, k] == pytest.approx(slope, rel=1e-4, abs=1e-4 * scale[:6].max())
+
+
+def test_a_contact_moved_by_its_tangent_agrees_with_contacts_beside(read):
+    """Force, moment and centre of each condyle; an equilibrium is differentiated with it."""
+    knee = knee_of(read[0])
+    pose = knee.pose(pressed(knee, read[1].q[60], 1200.0)).homogeneous
+    probe, move = knee.contact.probe(), 1e-7 * np.array([1, -1, 1, 40, -40, 40])
+    here = knee.contact.at(probe, pose)
+    moved, beside = (
+        [contact(sign * move).condyles for sign in (1.0, -1.0)]
+        for contact in (
+            lambda move: moved_contact(here, move),
+            lambda move: knee.contact.at(probe, displaced(pose, move)),
+        )
+    )
+    for side, name in itertools.product(here.condyles, ("wrench", "centre")):
+        found, expected = (
+            getattr(ahead[side], name) - getattr(behind[side], name)
+            for ahead, behind in (moved, beside)
+        )
+        assert found == pytest.approx(expected, rel=TOLERANCE, abs=TOLERANCE * abs(found).max())
