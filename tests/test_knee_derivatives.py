@@ -167,7 +167,7 @@ def test_many_presses_and_forces_are_stacked(read):
 
 
 def test_an_equilibrium(read, monkeypatch):
-    """Derivatives by slack length, stiffness and flexion agree with equilibria beside."""
+    """Derivatives by slack lengths, stiffnesses, load and flexion agree with equilibria beside."""
     sharp = replace(balance.BALANCE, force_tolerance=1e-7, step_tolerance=1e-12)
     monkeypatch.setattr(balance, "BALANCE", sharp)
     passes = replace(
@@ -183,32 +183,40 @@ def test_an_equilibrium(read, monkeypatch):
     found = knee.equilibrium(*state, released=free, derivatives=True)
     assert not found.failed
 
-    def rows(changed, q=state[0]):
-        other = changed.equilibrium(q, *state[1:], released=free)
+    def changed(bundle, name, step):
+        if name == "slack_length":
+            return replace(bundle, slack_length=bundle.slack_length + step)
+        return replace(bundle, law=bundle.law.stiffened(1.0 + step / bundle.law.stiffness))
+
+    def rows(name, step):
+        """Return coordinates and forces after a step of an input."""
+        q, external, bundles = state[0], pin.StdVec_Force(state[3]), plain.ligaments
+        if name == "flexion":
+            q = pin.integrate(plain.model, q, step * np.eye(plain.model.nv)[11])
+        elif name == "load":
+            insert = plain.bridge.insert
+            external[insert.joint] += insert.placement.act(pin.Force(step))
+        else:
+            bundles = [changed(one, name, size) for one, size in zip(bundles, step, strict=True)]
+        other = knee.with_ligaments(bundles).equilibrium(q, *state[1:3], external, released=free)
         sides = other.search.contact.condyles
         forces = [sides[side].force if side in sides else 0.0 for side in ("medial", "lateral")]
         return np.array([*other.coordinates, *forces])
 
-    for k in (0, 2):
-        for name, columns, step in (
-            ("slack_length", found.derivatives.by_slack_length, 1e-5),
-            # Below it rounding errors count: the forces hardly depend on the stiffness.
-            ("stiffness", found.derivatives.by_stiffness, 3e-4),
-        ):
-            ends = []
-            for sign in (1.0, -1.0):
-                bundles = list(plain.ligaments)
-                factor = 1.0 + sign * step
-                if name == "slack_length":
-                    value = bundles[k].slack_length
-                    bundles[k] = replace(bundles[k], slack_length=value * factor)
-                else:
-                    value = bundles[k].law.stiffness
-                    bundles[k] = replace(bundles[k], law=bundles[k].law.stiffened(factor))
-                ends.append(rows(knee.with_ligaments(bundles)))
-            slope = (ends[0] - ends[1]) / (2.0 * step * value)
-            scale = np.abs(slope)
-            assert columns[:, k] == pytest.approx(slope, rel=1e-4, abs=1e-4 * scale[:6].max())
+    slopes, signs = found.derivatives, np.array([1.0, -1.0, -1.0, 1.0, 1.0, -1.0])
+    lengths = np.array([bundle.slack_length for bundle in plain.ligaments])
+    stiffness = np.array([bundle.law.stiffness for bundle in plain.ligaments])
+    for name, columns, step in (
+        ("slack_length", slopes.by_slack_length, 1e-5 * lengths),
+        # Below it rounding errors count: the forces hardly depend on the stiffness.
+        ("stiffness", slopes.by_stiffness, 3e-4 * stiffness),
+        ("load", slopes.by_load, np.array([0.1, 0.1, 0.1, 2e-3, 2e-3, 2e-3])),
+        ("flexion", slopes.by_coordinate[:, 5:], np.array([1e-6])),
+    ):
+        step = step * np.resize(signs, len(step))
+        change = (rows(name, step) - rows(name, -step)) / 2.0
+        scale = np.abs(change)
+        assert columns @ step == pytest.approx(change, rel=1e-4, abs=1e-4 * scale[:6].max())
 
 
 def test_a_contact_moved_by_its_tangent_agrees_with_contacts_beside(read):
