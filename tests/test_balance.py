@@ -455,14 +455,16 @@ def test_a_diverged_search_with_rippled_forces_converges_in_a_second_search():
     coupling = rng.uniform(5e4, 3e5), -rng.uniform(1e3, 1e4)
     stiffness = np.array([[3e4, coupling[0]], [coupling[1], rng.uniform(2e3, 2e4)]])
     amplitude, wave = rng.uniform(10, 80), 2 * np.pi / rng.uniform(2e-4, 2e-3)
-    start = rng.uniform(-8e-3, 8e-3, 2)
+    start, asked = rng.uniform(-8e-3, 8e-3, 2), []
 
     def forces(x):
+        asked.append(x)
         slopes = stiffness + amplitude * wave * np.diag(np.cos(wave * x))
         return Trial(-stiffness @ x - amplitude * np.sin(wave * x), slopes)
 
     end = find_balance(forces, start)
     assert end.status is BalanceStatus.OK
+    assert end.trials == len(asked)
     assert np.abs(forces(end.coordinates).force).max() < 0.05
     assert np.linalg.eigvals(forces(end.coordinates).stiffness).real.min() > 0
     assert np.abs(end.coordinates - start).max() < 20e-3

@@ -14,6 +14,9 @@ FLIPPED = {
     ast.Lt: ">=", ast.LtE: ">", ast.Gt: "<=", ast.GtE: "<", ast.Eq: "!=", ast.NotEq: "==",
 }  # fmt: skip
 
+SYMMETRIC = ("max", "min", "np.maximum", "np.minimum", "math.hypot", "np.hypot")
+"""Functions whose arguments may be swapped."""
+
 
 @dataclass(frozen=True)
 class Fault:
@@ -104,7 +107,7 @@ class _Finder(ast.NodeVisitor):
 
     def visit_Call(self, node):
         plain = not any(isinstance(a, ast.Starred) for a in node.args)
-        if plain and len(node.args) >= 2:
+        if plain and len(node.args) >= 2 and self._source(node.func) not in SYMMETRIC:
             first, second = (self._source(a) for a in node.args[:2])
             if first != second:
                 rest = [self._source(a) for a in node.args[2:]]
