@@ -1,23 +1,26 @@
 """Released coordinates together with muscles that share the load."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
-from joints import dished_joint, joint_equations, push
+from joints import bundles, dished_joint, joint_equations, push
 from jw_gait import JW, needs_jw
 from mirrored_patient import write_mirrored_patient
 from scenes import MODEL, write_scene
 from shared_trials import two_flexors
 from tkamb.contact.foundation import ElasticFoundation
-from tkamb.geometry.frames import MIRROR
+from tkamb.geometry.frames import MIRROR, knee_pose
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.knee.crossing import CrossingLines, MuscleShare
 from tkamb.knee.load import total_wrench
 from tkamb.knee.relaxation import Relaxation
 from tkamb.knee.released_forces import SCALE, ReleasedForces, external_wrench
+from tkamb.knee.solution_derivatives import moved_contact
 from tkamb.run.muscles.shared_muscles import SharedMuscles
 from tkamb.run.read_scene import recording_of
 from tkamb.run.simulation import simulate
@@ -122,31 +125,45 @@ def test_a_left_leg_with_muscles_gives_the_mirrored_result(tmp_path, equilibria)
 
 
 def test_the_tension_per_wrench_is_that_of_a_second_search():
-    """The tangent agrees with a second search under slightly more load."""
-    state = ElasticFoundation(resolution=1e-3, law="linear").prepare(dished_joint())
+    """The tangent agrees with a second search under slightly more load: closely with a contact
+    that is linear, roughly with the columns of the foundation.
+    """
     model, start = ElasticFoundation(resolution=1e-3, law="linear"), np.zeros(6)
+    state = model.prepare(dished_joint())
     start[1] = state.pair.first_touch_height(np.eye(4)) - 5e-5
     load = push((20.0, 900.0, 5.0), (0.003, 0.0, 0.004))
+    ends = [((x, 0.0, 0.03), (0.0, -0.04, 0.03), 0.0745) for x in (-0.01, 0.02)]
 
-    def equilibrium(external, coordinates):
-        joint = joint_equations(external)
-        forces = ReleasedForces(joint, model.probe(state), coordinates)
-        balance = forces.balance()
+    def joint_of(external):
+        return joint_equations(external, ligaments=bundles(ends))
+
+    def equilibrium(external, coordinates, probe):
+        joint = joint_of(external)
+        forces = ReleasedForces(joint, probe, coordinates)
+        balance = forces.polished(forces.balance(), 1000.0)
         contact = forces.contact(balance)
         coordinates = forces.at(balance)
         return coordinates, contact, float(joint.reactions(coordinates, contact.wrench)[-1])
 
-    coordinates, contact, tension = equilibrium(load, start)
-    forces = ReleasedForces(joint_equations(load), model.probe(state), coordinates)
+    coordinates, contact, tension = equilibrium(load, start, model.probe(state))
+    forces = ReleasedForces(joint_of(load), model.probe(state), coordinates)
     compliance = forces.tension_per_wrench(contact)
     assert forces.tension_in_equilibrium(contact, compliance) == pytest.approx(tension, rel=1e-4)
+    here = pin.SE3(knee_pose(coordinates)).inverse()
+    linear = SimpleNamespace(
+        at=lambda pose: moved_contact(contact, pin.log6(pin.SE3(pose) * here).vector)
+    )
     added = push((1.0, 20.0, 0.5), (0.004, 0.01, -0.01))
-    change = equilibrium(load + added, coordinates)[2] - tension
     rigid = joint_equations(added).reactions(coordinates, np.zeros(6))[-1]
+    exact, change = (
+        equilibrium(load + added, coordinates, probe)[2] - tension
+        for probe in (linear, model.probe(state))
+    )
+    assert compliance @ added - rigid == pytest.approx(exact - rigid, rel=1e-5)
     assert compliance @ added == pytest.approx(change, rel=0.01)
     assert abs(rigid - change) > 0.05 * abs(change)
     # near equilibrium: the residual is treated as an additional wrench
-    away = ReleasedForces(joint_equations(load + added), model.probe(state), coordinates)
+    away = ReleasedForces(joint_of(load + added), model.probe(state), coordinates)
     assert away.tension_in_equilibrium(contact, compliance) == pytest.approx(
         tension + change, rel=1e-3
     )
