@@ -69,6 +69,14 @@ def test_linear_springs_reach_their_equilibrium():
         assert end.smallest_stiffness == pytest.approx(np.linalg.eigvalsh(stiffness)[0], rel=1e-3)
 
 
+def test_the_first_step_teaches_the_stiffness_of_a_linear_spring():
+    """The secant through two points of a line is the line: the second step ends the search."""
+    for guess in (0.8e5, 1.5e5):
+        end = find_balance(lambda x: Trial(50.0 - 1e5 * x), np.zeros(1), np.array([[guess]]))
+        assert end.coordinates == pytest.approx(5e-4, abs=1e-12)
+        assert end.steps == 2
+
+
 def hardening(guide=None):
     """Return the trial function of hardening springs, f = load - K x - c x³, and its equilibrium.
 

@@ -94,6 +94,17 @@ def test_slopes_of_smooth_peak_pressures_agree_with_central_differences(read, na
         assert compared.kinks <= 1
 
 
+def test_smooth_peaks_of_a_model_without_slopes_of_pressures(read, monkeypatch):
+    """A model of another package: central differences agree with the exact slopes."""
+    knee = knee_of(read[0])
+    q = pressed(knee, read[1].q[60], 1000.0)
+    peaks, slopes = knee.condyle_pressures(q), knee.condyle_pressure_slopes(q)
+    monkeypatch.delattr(foundation.FoundationProbe, "loaded_points")
+    assert knee.condyle_pressures(q) == pytest.approx(peaks, rel=1e-9)
+    found = knee.condyle_pressure_slopes(q)
+    assert found == pytest.approx(slopes, rel=1e-4, abs=1e-4 * np.abs(slopes).max())
+
+
 def test_dynamics(read):
     knee = knee_of(read[0])
     rng = np.random.default_rng(3)

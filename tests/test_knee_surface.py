@@ -11,7 +11,7 @@ import pinocchio as pin
 import pytest
 
 import tkamb
-from knee_bodies import MIRROR, mirrored_se3
+from knee_bodies import MIRROR, mirrored_se3, whole_body
 from test_knee import FOUNDATION, SCENE, at
 from test_knee_plain_model import state_of, without_patella
 from tkamb.contact import samples
@@ -280,6 +280,20 @@ def test_angles_in_degrees_and_numbers_that_are_not_finite_are_refused(read):
     ):
         with pytest.raises(InputError, match=refused):
             call()
+
+
+def test_only_a_patella_may_be_unknown(read):
+    """The contact of the condyles does not change. Its indices in q are not those in v."""
+    body = whole_body(read[0])
+    q, joint = body.state(*at(read, 60))[0], body.model.joints[body.model.getJointId("cap_free")]
+    first, last = joint.idx_q, joint.idx_q + joint.nq - 1
+    known = body.knee.evaluate(q)
+    for k in (first, last):
+        found = body.knee.evaluate(np.where(np.arange(len(q)) == k, np.nan, q))
+        assert (found.wrench_on_insert == known.wrench_on_insert).all()
+    for k in (first - 1, last + 1):
+        with pytest.raises(InputError, match=rf"q\[{k}\] is nan"):
+            body.knee.evaluate(np.where(np.arange(len(q)) == k, np.nan, q))
 
 
 def test_an_argument_of_a_wrong_kind_is_refused_by_name(read):

@@ -176,6 +176,14 @@ def test_the_rolling_of_a_roll_slip_motion_is_recovered(roller: Surface) -> None
     assert slipped[:, 0] == pytest.approx(0.01, abs=2e-5)
 
 
+def test_rolling_in_a_trough_follows_its_arc_in_steps_of_ten_degrees(roller: Surface) -> None:
+    """The error is of second order in the step: Euler's method would miss by 0.1 mm."""
+    original = motion(0.02, FLEXION)[::10]
+    rolled = roll_slip_motion(roller, bed(True), 0.0, original, np.zeros(len(original)))
+    angle = np.arcsin(0.02 / TROUGH) - RADIUS * FLEXION[::10] / TROUGH
+    assert rolled[:, 0] == pytest.approx(TROUGH * np.sin(angle), abs=1e-5)
+
+
 def test_slip_beside_the_insert_is_nan(roller: Surface) -> None:
     coordinates = motion(np.linspace(0.0, -0.05, FRAMES), FLEXION)
     medial, _ = both(condyle_slip(roller, bed(False), 0.0, coordinates))
