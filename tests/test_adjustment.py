@@ -181,6 +181,7 @@ def test_the_adjustment_stays_if_it_exceeds_the_deformation(query: ClosestPointQ
     result, adjustment = pressed(query, 0.3, 4e-4, 500.0, "either")
     assert adjustment.penetration < abs(adjustment.translation)
     assert not adjustment.restored
+    assert not result.flags
     assert result.medial.force == pytest.approx(result.lateral.force, rel=1e-3)
 
 
@@ -188,6 +189,7 @@ def test_deeper_press_restores_the_recorded_rotation(query: ClosestPointQuery) -
     """The femur is not moved along y, so every penetration exceeds the adjustment."""
     result, adjustment = pressed(query, 0.3, 0.0, 2500.0, "either")
     assert adjustment.restored
+    assert not result.flags
     assert adjustment.penetration > 1e-5
     assert result.pose[:3, :3] == pytest.approx(tilted(0.3)[:3, :3])
     forces = [side.force for side in (result.medial, result.lateral) if side is not None]

@@ -177,8 +177,12 @@ def test_many_presses_and_forces_are_stacked(read):
         knee.press(q, np.ones(2))
 
 
-def test_an_equilibrium(read, monkeypatch):
-    """Derivatives by slack lengths, stiffnesses, load and flexion agree with equilibria beside."""
+@pytest.mark.parametrize("extension", [0.0, 100.0])
+def test_an_equilibrium(read, monkeypatch, extension):
+    """Derivatives by slack lengths, stiffnesses, load and flexion agree with equilibria beside.
+
+    A moment that extends the knee (N·m) makes the quadriceps slack.
+    """
     sharp = replace(balance.BALANCE, force_tolerance=1e-7, step_tolerance=1e-12)
     monkeypatch.setattr(balance, "BALANCE", sharp)
     passes = replace(
@@ -188,11 +192,15 @@ def test_an_equilibrium(read, monkeypatch):
         contact_force_share=0.0,
     )
     monkeypatch.setattr(released, "RELEASED_KNEE", passes)
-    plain, state = read[0], at(read, 60)
-    knee = knee_of(plain, extensor=plain.extensor)
+    plain, (*state, ground) = read[0], at(read, 60)
+    knee, insert = knee_of(plain, extensor=plain.extensor), plain.bridge.insert
+    external = pin.StdVec_Force(ground)
+    moment = pin.Force(np.zeros(3), np.array([0.0, 0.0, extension]))
+    external[insert.joint] += insert.placement.act(moment)
     free = ("ap", "ml", "axial_rotation", "adduction")
-    found = knee.equilibrium(*state, released=free, derivatives=True)
+    found = knee.equilibrium(*state, external, released=free, derivatives=True)
     assert not found.failed
+    assert (found.loads.quadriceps == 0.0) == (extension > 0.0)
 
     def changed(bundle, name, step):
         if name == "slack_length":
@@ -201,18 +209,17 @@ def test_an_equilibrium(read, monkeypatch):
 
     def rows(name, step):
         """Return coordinates and forces after a step of an input."""
-        q, external, bundles = state[0], pin.StdVec_Force(state[3]), plain.ligaments
+        q, forces, bundles = state[0], pin.StdVec_Force(external), plain.ligaments
         if name == "flexion":
             q = pin.integrate(plain.model, q, step * np.eye(plain.model.nv)[11])
         elif name == "load":
-            insert = plain.bridge.insert
-            external[insert.joint] += insert.placement.act(pin.Force(step))
+            forces[insert.joint] += insert.placement.act(pin.Force(step))
         else:
             bundles = [changed(one, name, size) for one, size in zip(bundles, step, strict=True)]
-        other = knee.with_ligaments(bundles).equilibrium(q, *state[1:3], external, released=free)
+        other = knee.with_ligaments(bundles).equilibrium(q, *state[1:], forces, released=free)
         sides = other.search.contact.condyles
-        forces = [sides[side].force if side in sides else 0.0 for side in ("medial", "lateral")]
-        return np.array([*other.coordinates, *forces])
+        pressed = [sides[side].force if side in sides else 0.0 for side in ("medial", "lateral")]
+        return np.array([*other.coordinates, *pressed])
 
     slopes, signs = found.derivatives, np.array([1.0, -1.0, -1.0, 1.0, 1.0, -1.0])
     lengths = np.array([bundle.slack_length for bundle in plain.ligaments])

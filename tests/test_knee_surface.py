@@ -296,6 +296,31 @@ def test_only_a_patella_may_be_unknown(read):
             body.knee.evaluate(np.where(np.arange(len(q)) == k, np.nan, q))
 
 
+def test_the_ligament_wraps_the_insert_in_the_plane_of_its_end(read):
+    """A move of the end along this plane does not change the outline, a move across it does."""
+    plain, outlines = read[0], []
+    line = plain.extensor.patellar_ligament
+    for move in ([0.0, 0.0, 0.0], [0.0, -5e-3, 0.0], [0.0, 0.0, 5e-3]):
+        end = replace(line.distal, position=line.distal.position + move)
+        extensor = replace(plain.extensor, patellar_ligament=replace(line, distal=end))
+        knee = tkamb.Knee(plain.model, implant=plain.implant, extensor=extensor)
+        outlines.append(knee.extensor_lines.ligament.wrap.outline)
+    here, along, across = outlines
+    assert along == pytest.approx(here, abs=1e-12)
+    assert np.abs(across.max(axis=0) - here.max(axis=0)).max() > 1e-4
+
+
+@pytest.mark.parametrize("link", ["femur", "hip"])
+def test_an_origin_inside_the_femoral_component_is_refused(read, link):
+    plain = read[0]
+    inside = plain.femoral.bounds.mean(axis=0) - getattr(plain.anatomy, link).placement.translation
+    muscle = plain.extensor.quadriceps
+    muscle = replace(muscle, points=((link, tuple(inside)), muscle.points[-1]))
+    extensor = replace(plain.extensor, quadriceps=muscle)
+    with pytest.raises(InputError, match="the origin of quadriceps: lies inside the outline"):
+        tkamb.Knee(plain.model, implant=plain.implant, extensor=extensor)
+
+
 def test_an_argument_of_a_wrong_kind_is_refused_by_name(read):
     knee, motion, _ = read
     q, v, model = motion.q[60], motion.v[60], knee.model
