@@ -267,7 +267,7 @@ class MuscleTable(SceneTable):
 
 
 class QuadricepsTable(SceneTable):
-    """Quadriceps line: the short form of a [[muscle]] of this name with two points.
+    """Quadriceps line: the short form of a [[muscle]] with the name quadriceps and two points.
 
     It runs from the vastus intermedius origin to the patella and wraps the sagittal outline of
     the femoral component, and of `bone` if given.

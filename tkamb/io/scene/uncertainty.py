@@ -104,10 +104,10 @@ class CorrelationTable(SceneTable):
 
 
 class UncertaintyTable(SceneTable):
-    """Errors of the inputs, for `tkamb uncertainty`. A pose error is one offset per sample plus
-    noise per frame, every other error one draw per sample.
+    """Errors of the inputs, for `tkamb uncertainty`. Each key is a standard deviation.
 
-    Errors are independent, except those in [[uncertainty.correlation]].
+    A pose error is one offset per sample plus noise per frame. Every other error is one draw per
+    sample. Errors are independent, except those in [[uncertainty.correlation]].
     """
 
     seed: Count = Field(

@@ -94,7 +94,7 @@ class ContactModelTable(SceneTable):
 class CohortWearTable(SceneTable):
     """Wear of the insert of every run under the motion of that run.
 
-    Closing of the cycle, material and law are those of [wear] in the scene.
+    The closing of the cycle, the wear material and the wear law are those of [wear] in the scene.
     """
 
     cycles: Annotated[Count, Field(ge=1, le=10**9)] = 1_000_000
@@ -107,7 +107,7 @@ class CohortWearTable(SceneTable):
 class CohortTable(SceneTable):
     """The cohort file.
 
-    Its axes are subject, trial, design and contact; one without entries changes nothing.
+    Its axes are subject, trial, design and contact. An axis without entries changes nothing.
     """
 
     title: str = "Cohort"
