@@ -11,10 +11,9 @@ By the implicit function theorem, with J0 and J1 of `pin.dIntegrate`,
 
     (I - h a_v - h² a_q J1) dv' = dv + h a_q J0 dq + h a_u du.
 
-`CondyleForces` and `CondylePressures` are residuals for costs on the contact. Out of the model's
-range, or without convergence of Newton's method, the next state is NaN, and the solver shortens its
-step. The models are Python objects: set `nthreads = 1` in a `ShootingProblem` (more threads were
-not tested). Crocoddyl must fit the installed Pinocchio (`tkamb.crocoddyl_pair`).
+Out of the model's range, or without convergence of Newton's method, the next state is NaN, and the
+solver shortens its step. The models are Python objects: set `nthreads = 1` in a `ShootingProblem`
+(more threads were not tested). Crocoddyl must fit the installed Pinocchio (`tkamb.crocoddyl_pair`).
 
 Reference: Mastalli et al., Crocoddyl: an efficient and versatile framework for multi-contact
 optimal control, ICRA (2020), doi:10.1109/ICRA40945.2020.9196673.

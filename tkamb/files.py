@@ -5,9 +5,8 @@ device has no end, and a table of gigabytes is not a recording.
 
 Writing: a file is written under a temporary name in the same folder, then renamed, so that no link
 is followed. Files that belong together are all written first; then a journal lists them, and they
-are renamed. If the process is killed before the journal is written, the old files remain. If it is
-killed later, the next command that writes into the folder finishes the renames
-(`finish_replacement`). Readers change nothing.
+are renamed. If the process is killed before the journal is written, the old files remain; if later,
+the next command that writes into the folder finishes the renames (`finish_replacement`).
 """
 
 import codecs

@@ -19,7 +19,6 @@ class NamedClasses(Generic[Base]):
 
     Attributes:
         kind: singular noun for these classes in messages, e.g. "contact model".
-        base: common base class.
         group: entry-point group of the classes in other packages.
         built_in: name -> "module:Class" of the built-in classes.
     """

@@ -67,10 +67,8 @@ def check_contact_model(
         model: the contact model.
         pair: the two bodies; default: `two_sphere_pair`.
         pose: (4, 4) pose_femoral_in_insert; default: 10 deg of flexion, 0.2 deg of varus.
-        load: N, compressive.
         tolerance: 1, relative tolerance of forces, approach and pressure between equivalent
             evaluations.
-        integral_tolerance: 1, relative tolerance of the integral of pressure over the map.
 
     Raises:
         ConformanceError: the model lacks a property of the contract.

@@ -26,7 +26,6 @@ class Setting:
 
     Args:
         name: dotted name, such as "lattice_solver.force_tolerance".
-        meaning: unit, meaning and origin.
         algorithm: first line of the docstring of the settings class.
     """
 

@@ -7,7 +7,7 @@ frame (x anterior, y superior, z to the right) the turned axes are
 
 where x_f is the flat front of the post (`tkamb.geometry.post.divide_insert`), and y_m and z_m are
 the middle of the post's bounding box. The front is the fixed bottom of the layer, and the post's
-depth its thickness. The post does not bend at its root. The pair is evaluated at a given pose, with
+depth its thickness: the post does not bend at its root. The pair is evaluated at a given pose, with
 rotation R and translation t of pose_insert_in_turned.
 
 X = [[R, t x R], [0, R]] maps a small displacement of the femur (translation of its point at the

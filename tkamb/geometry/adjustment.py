@@ -13,10 +13,8 @@ The errors of about 0.5 mm and 0.5 deg exceed the deformation. Both are limits o
 
 Sharma (2008) does not give the centre of the turn; here it is the component's, which registration
 places best. A turn of 0.4 deg about the contact points, 25 mm below, would shift the component by
-0.2 mm. In dishes little wider than the condyles the contact would move by 1.3 mm, and the total
+0.2 mm; in dishes little wider than the condyles the contact would move by 1.3 mm, and the total
 force would change by 0.02 BW.
-
-`tkamb.knee.adjustment` may restore the recorded rotation after the press.
 """
 
 import math

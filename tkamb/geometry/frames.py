@@ -1,6 +1,6 @@
 """Poses as 4x4 matrices and the knee coordinates of Grood and Suntay.
 
-`pose_A_in_B` maps points from frame A to frame B. The functions broadcast over leading axes.
+`pose_A_in_B` maps points from frame A to frame B; the functions broadcast over leading axes.
 
 The axes of the insert frame are x anterior, y superior, z to the right. The pose of the femoral
 component of a right knee (left knees are mirrored at input) is

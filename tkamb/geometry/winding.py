@@ -13,7 +13,7 @@ Positions in the plan view are integers (`PlanGrid`, steps of about 1e-10 m), so
 that decide whether a ray passes through a triangle are exact, also at edges and vertices. A ray
 that meets an edge exactly is moved by an infinitesimal distance to +z, and by a much smaller one to
 +x (simulation of simplicity, Edelsbrunner & Muecke, ACM Trans Graph 9:66 (1990),
-doi:10.1145/77635.77639). The result is correct for all points off the surface.
+doi:10.1145/77635.77639).
 
 In a closed surface the sum over the triangles below, with the opposite sign, is equal; if a ray
 leaves through a small hole, the larger sum is the result.

@@ -1,21 +1,19 @@
 """The patellar button pressed on the femoral component by a contact model.
 
 Contact models press a rigid femoral component along -y into a body whose flat bottom lies in y = 0.
-The button is that body: its flat back is fixed to the patella, and its articular surface faces the
-femur. In the button frame y points from the back to the articular surface, x is superior and z is
-to the subject's right. In the patella's frame (x anterior, y superior, z to the right) these axes
-are
+Here this is the button, whose flat back is fixed to the patella. In the button frame y points from
+the back to the articular surface, x is superior and z is to the subject's right. In the patella's
+frame (x anterior, y superior, z to the right) these axes are
 
     x_b = y,    y_b = -x,    z_b = z,
 
 turned further by the few degrees that make the back level. The origin is the middle of the back's
 bounding rectangle.
 
-The equations of the knee give the patellofemoral force F along the contact normal n, from femur to
-patella, and the pose of the patella. The button is pressed along its axis y_b at this pose, until
-the contact carries the axial part of the force, -F (n . y_b). The contact is frictionless. Its
-force across the axis follows from the surfaces, and the sagittal difference to F n is a result
-(`ButtonPress.imbalance`), as a residual is.
+The button is pressed along its axis y_b at the patella's pose, until the contact carries the axial
+part, -F (n . y_b), of the patellofemoral force F of the equations along the contact normal n, from
+femur to patella. The contact is frictionless: its force across the axis follows from the surfaces,
+and the sagittal difference to F n is a result (`ButtonPress.imbalance`), as a residual is.
 
 Medial and lateral facet are the parts of the contact on the two sides of the patella's sagittal
 plane, in the femoral frame.
@@ -69,9 +67,9 @@ class ButtonPress:
     """The button pressed on the femoral component at one instant, as that of a right knee.
 
     Args:
-        force: patellofemoral force of the equations on the patella, insert frame, shape (3,), N.
-            Of a released patella: the force that its lines require of the contact.
-        pose: pose_button_in_insert of the contact, shape (4, 4).
+        force: patellofemoral force of the equations on the patella, insert frame, (3,), N. Of a
+            released patella: the force that its lines require of the contact.
+        pose: pose_button_in_insert of the contact, (4, 4).
         contact: the contact in the button frame. "Insert" in the names of `ContactResult` means
             the button. None: there is no contact, see `problem`.
         start: warm start of the next press; None: there is none.
@@ -139,7 +137,7 @@ class Button:
 
     Args:
         contact: contact model, with femoral component and button as its pair (`button_pair`).
-        in_patella: pose_button_in_patella, shape (4, 4).
+        in_patella: pose_button_in_patella, (4, 4).
     """
 
     def __init__(self, contact: KneeContact, in_patella: Array) -> None:
@@ -156,9 +154,9 @@ class Button:
         """Return the button pressed with a patellofemoral force.
 
         Args:
-            femur: pose_femoral_in_insert, shape (4, 4).
-            patella: pose_patella_in_insert, shape (4, 4).
-            force: force on the patella, insert frame, shape (3,), N.
+            femur: pose_femoral_in_insert, (4, 4).
+            patella: pose_patella_in_insert, (4, 4).
+            force: force on the patella, insert frame, (3,), N.
             start: contact at a neighbouring pose; None: no warm start.
         """
         began, button = clock.perf_counter(), patella @ self.in_patella

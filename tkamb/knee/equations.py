@@ -59,7 +59,7 @@ class Extensor:
     Args:
         patellar_ligament: loads on the links at one newton.
         contact_point: point of patellofemoral contact, (3,), m.
-        contact_normal: unit normal from femur to patella, in the sagittal plane, shape (3,).
+        contact_normal: unit normal from femur to patella, in the sagittal plane, (3,).
         muscles: names of the muscles that insert on the patella.
         wrap: angle by which the extensor group wraps the femur, rad.
         released: patella whose contact force may leave the sagittal plane; None: it moves in its

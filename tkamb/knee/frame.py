@@ -175,7 +175,6 @@ class FrameMethod:
     Args:
         knee: a knee of a right leg.
         coupled: whether the contact's resultants replace the contact points in the equations.
-        released: names of the released coordinates.
         adjust: settings of the femoral adjustment; None: no adjustment.
         split_sensitivity: whether to compute the change of the medial force with adduction. A
             contact model without a tangent needs one more press for it.

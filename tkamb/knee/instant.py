@@ -257,7 +257,6 @@ class Instant:
         The rates are those of q and v.
 
         Args:
-            coordinates: knee coordinates, (6,), m and rad.
             point: position, insert frame, (3,), m.
         """
         velocity, spin = knee_twist(coordinates, self.motion.joints[1, :6])
@@ -288,7 +287,6 @@ class Instant:
         """Return a geometry with a contact's resultants as its contact points.
 
         Args:
-            coordinates: knee coordinates, (6,), m and rad.
             condyles: loaded side -> its load on the insert at these coordinates.
             points: side -> point (3,), m, where an unloaded condyle is nearest to the insert.
         """

@@ -26,7 +26,7 @@ class KneeLoads:
     are NaN.
 
     Args:
-        contact_force: force of the insert on the femur without residuals, shape (3,), N.
+        contact_force: force of the insert on the femur without residuals, (3,), N.
         normal_force: side -> force of the condyle along its contact normal, by equilibrium, N.
         quadriceps: tension of the quadriceps, N.
         patellar_ligament: tension of the patellar ligament, N.
@@ -35,8 +35,8 @@ class KneeLoads:
         ligaments: bundle -> tension, N.
         residuals: loads on the tibia that are zero in an exact model: ap, ml (N), axial and, in
             some load states, coronal and flexion (N·m).
-        hip_force: sum of all loads across the hip on the femur, shape (3,), N.
-        hip_moment: moment of these loads about the hip centre, shape (3,), N·m.
+        hip_force: sum of all loads across the hip on the femur, (3,), N.
+        hip_moment: moment of these loads about the hip centre, (3,), N·m.
         external_flexion: external moment, positive in flexion, N·m.
         external_adduction: external moment, positive in adduction, N·m.
         condition: condition number of the equations.

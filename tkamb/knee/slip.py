@@ -8,8 +8,8 @@ geometric centre of the femoral component causes the part a_axial of a_i:
     slip = sum (a_f - (a_i - a_axial)),   a_axial = d(alpha) (z_condyle - z_centre) / cos(slope)
 
 alpha is positive if the femur rotates externally, slip if the femur's surface slides forwards on
-the insert. The rate of the slip is the x velocity of the femur's contact point relative to the
-insert, without the axial part; `sliding_velocity` computes it without arcs.
+the insert. Its rate is the x velocity of the femur's contact point relative to the insert, without
+the axial part; `sliding_velocity` computes it without arcs.
 
 If the tangent of a profile turns by d between two points, the arc is chord (d/2)/sin(d/2). This is
 exact on a circle, and of third order in the step on other profiles.

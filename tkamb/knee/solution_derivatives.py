@@ -262,7 +262,7 @@ class ImplicitEquilibrium:
         With a released patella the moment that holds flexion is the last of them.
 
         Args:
-            coordinates: knee coordinates, shape (6,).
+            coordinates: knee coordinates, (6,).
             changed: ligament that replaces that of its name.
             slack: whether the extensor mechanism carries no load; None: as in the equilibrium.
         """
@@ -302,7 +302,7 @@ class _PatellaPull:
         method: how the patella is found.
         poses: link -> pose (4, 4) of femur and tibia in the insert frame.
         tension: tension of the quadriceps, N.
-        coordinates: coordinates of the patella, shape (6,).
+        coordinates: coordinates of the patella, (6,).
     """
 
     def __init__(

@@ -20,8 +20,8 @@ length is continuous. L is homogeneous of degree one in P, Q and k, so that
 
 where u_P and u_Q are the string's directions at P and Q. The force on the point is -∂L/∂k ∂k/∂P.
 
-For several objects, the touching points on one object after the other are updated until none moves.
-Then every straight part is tangent to the objects at its ends: the string is taut.
+For several objects, the touching points are updated in turn until none moves: every straight part
+is then tangent to the objects at its ends.
 
 A string of unit tension exerts balanced forces on each path point, and on each wrap object where it
 meets and leaves it.

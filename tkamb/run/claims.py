@@ -165,7 +165,6 @@ class MethodError:
     Args:
         trials: measured trials with these muscles in this activity; if there are none, of all
             activities.
-        same_activity: whether the trials are of the activity of the run.
     """
 
     activity: str | None

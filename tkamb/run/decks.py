@@ -4,9 +4,10 @@ Both decks contain the hexahedra of the insert, with contact nodes on the smooth
 approximates its mesh, as in the lattice, and a rigid, faceted patch of the femoral component that
 moves along y only.
 
-CalculiX: contact is node to surface by penalty. The force on a node is its pressure times its
-tributary area of the deformed faces. The patch is a layer of wedges, which starts at a guessed
-depth in the insert, under the whole load; CalculiX finds the equilibrium.
+CalculiX: contact is node to surface by penalty, and a node's force its pressure times its tributary
+area of the deformed faces. The patch is a layer of wedges, which starts in the insert at the
+approach of the foundation model (not the run's solution), under the whole load; CalculiX finds the
+equilibrium.
 
 FEBio: the insert is an isotropic elastic (St. Venant-Kirchhoff) solid in finite deformation.
 Contact is sliding-elastic and frictionless, by augmented Lagrangian. The patch is displaced from
@@ -14,8 +15,6 @@ first touch by the approach of the run, and FEBio returns the force: a load cann
 since the stiffness is zero at first touch.
 
 Reference: FEBio User Manual 4.0, chapter 3, the input file format.
-
-The guess is the approach of the foundation model, not the solution of the run.
 """
 
 from collections.abc import Iterable, Iterator
@@ -207,7 +206,6 @@ def press_problem(pair: ContactPair, load: float, pose: Array, grid_mm: float) -
     """Return a press as a finite-element problem.
 
     Args:
-        load: load along -y, N.
         pose: pose_femoral_in_insert, (4, 4); its y is not used.
         grid_mm: edge of the hexahedra, mm.
 

@@ -94,7 +94,6 @@ class TrialError:
     G.
 
     Args:
-        activity: as in [output] activity.
         inputs: root mean square over the frames of the standard deviation due to the inputs, as a
             share of G.
         correlation_s: time in which the autocorrelation of the error falls to 1/e, s.
@@ -120,7 +119,6 @@ class Discrepancy:
         deviation: scale of Student's t, as a share of G; the variance due to the inputs is
             subtracted.
         freedom: degrees of freedom of Student's t, in general not an integer.
-        trials: number of trials of all activities.
     """
 
     mean: float
@@ -188,7 +186,6 @@ def fitted(errors: Sequence[TrialError], force: str, activity: str | None) -> Di
     """Return the discrepancy of a force in an activity; None: no trial has its error.
 
     Args:
-        errors: errors of all compared trials.
         activity: activity of the scene. Without trials of it (or None) the mean is 0.
     """
     chosen = [one for one in errors if one.force == force]

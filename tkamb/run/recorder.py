@@ -6,8 +6,8 @@ remaining frames have the status "failed: not computed". A resumed run reads the
 removed when all results are written. Before the first frame is finished, nothing in the output
 folder changes.
 
-`.frames` also has the run's identity. Each frame has a SHA-256 over identity, frame number and
-content; one with another SHA-256 counts as absent.
+`.frames` also has the run's identity. A frame whose SHA-256 over identity, frame number and content
+differs counts as absent.
 """
 
 import hashlib

@@ -5,7 +5,7 @@ from standard input, and writes pickled answers to standard output until the inp
 parent was killed. Unlike multiprocessing, it does not import the calling script.
 
 Dask is an extra (`pip install 'tkamb[cluster]'`). If a cluster's worker dies, another one repeats
-its job. A job is a function of its number and content only, whatever the worker.
+its job, which is a function of its number and content only.
 """
 
 import argparse

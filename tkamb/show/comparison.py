@@ -32,9 +32,9 @@ class Pairing:
     """Interpolation of another run at the f frames of the first run.
 
     Args:
-        lower: the other run's frame before each frame of the first, shape (f,); -1: not comparable.
-        upper: the other run's frame after each frame of the first, shape (f,).
-        weight: weight of the upper frame, 0 to 1, shape (f,).
+        lower: the other run's frame before each frame of the first, (f,); -1: not comparable.
+        upper: the other run's frame after each frame of the first, (f,).
+        weight: weight of the upper frame, 0 to 1, (f,).
         exact: whether frames are paired at equal times, without interpolation.
     """
 
@@ -132,12 +132,10 @@ class Difference:
     """Difference of one column: a run minus the first run.
 
     Args:
-        max_abs: largest absolute difference.
         percent: largest difference, % of the largest absolute value of the first run; NaN if that
             value is zero.
         at_frame: frame of the first run with the largest difference.
         at: position of this frame on the axis, deg, % or s.
-        mean: mean of the signed differences.
     """
 
     run: str

@@ -69,11 +69,10 @@ class LegFrame:
     """The leg at one frame in the laboratory, m.
 
     Args:
-        joints: centres of hip, knee and ankle, shape (3, 3). The knee is the origin of the insert
-            frame.
+        joints: centres of hip, knee and ankle, (3, 3). The knee is the origin of the insert frame.
         lines: ligaments and tendons, each with points (n, 3), its colour and its name.
-        force: force on the foot, N, shape (3,); None without a plate.
-        point: point of application of the force, shape (3,).
+        force: force on the foot, N, (3,); None without a plate.
+        point: point of application of the force, (3,).
         loaded: whether the foot stands on the plate; otherwise no arrow is drawn.
     """
 

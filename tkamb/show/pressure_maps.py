@@ -283,10 +283,9 @@ def draw_pressure(
     """Draw the pressure of one frame over the insert.
 
     Args:
-        pressure: pressure at the map points, shape (n,), in the scale's unit.
+        pressure: pressure at the map points, (n,), in the scale's unit.
         scale: colour scale that begins at 0.
-        gap: gap at the map points, m, shape (n,). It locates the edge of the contact between the
-            points.
+        gap: gap at the map points, m, (n,). It locates the edge of the contact between the points.
     """
     peak = float(scale.vmax or 1.0)
     apart = None if gap is None else gap[None]

@@ -1,15 +1,15 @@
 """CalculiX as an independent check of the lattice, on the same hexahedra, pose and load.
 
-CalculiX runs as a process with one thread and a time limit, and uses no result of the lattice. At
-the initial position of the femoral component an elastic foundation carries the load. CalculiX has
-no warm start, so its cold and warm times are equal.
+CalculiX runs as a process with one thread and a time limit, and uses no result of the lattice. It
+starts at the depth at which an elastic foundation carries the load
+(docs/development/peer_calculix.md). CalculiX has no warm start, so its cold and warm times are
+equal.
 
-The contact nodes lie on the smooth surface of the insert's mesh, as in the lattice; the femoral
-component is faceted. Its pressures on deformed faces are converted to nodal forces and divided by
-the undeformed tributary areas, as in the built-in models.
+Its pressures on deformed faces are converted to nodal forces and divided by the undeformed
+tributary areas, as in the built-in models.
 
-Linear cases use small strain in both programs. With the Ramberg-Osgood law CalculiX uses finite
-strain (true stress as a function of Eulerian strain) and the built-in models use small strain.
+Linear cases use small strain in both programs; with the Ramberg-Osgood law CalculiX uses finite
+strain (true stress as a function of Eulerian strain), the built-in models small strain.
 """
 
 import math
@@ -206,7 +206,7 @@ def press_by_calculix(
 
     Args:
         load: force along -y, N.
-        pose: pose_femoral_in_insert, shape (4, 4); its y has no effect.
+        pose: pose_femoral_in_insert, (4, 4); its y has no effect.
         grid_mm: edge length of the hexahedra, mm.
         element: element type, "C3D8I" or "C3D8".
 

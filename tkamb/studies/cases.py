@@ -85,7 +85,6 @@ def dishes(thickness: float, radius: float, apart: float, rim: float = 2e-3) -> 
 
     Args:
         thickness: thickness under the lowest points of the dishes, m.
-        radius: radius of curvature at the lowest points, m.
         apart: z of the middle of the lateral dish, m; the medial middle is at -apart.
         rim: height of the rim above the lowest points, m.
     """
@@ -150,7 +149,7 @@ class StudyCase:
     """One contact problem.
 
     Args:
-        pose: pose_femoral_in_insert, shape (4, 4); its y has no effect.
+        pose: pose_femoral_in_insert, (4, 4); its y has no effect.
         load: force along -y, N.
         sphere: dimensions, if the case is a sphere on a linear layer.
     """

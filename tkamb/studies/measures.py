@@ -170,7 +170,6 @@ class Measure:
         prepare_seconds: median time of `prepare` without the cache on disk, s.
         cold_seconds: median time of a first press without a warm start, s.
         warm_seconds: median time of a press at the next pose with a warm start, s.
-        peak_rss_MB: peak memory of the process, MB.
         values: quantities of the first press, see `quantities`.
         map: "i j" -> pressure, Pa, on a raster of 1 mm.
     """

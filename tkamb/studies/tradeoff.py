@@ -4,8 +4,8 @@ A `Row` has the times and errors of one model on one case; the rows that no othe
 case's Pareto front. Fine grids and solver options are measured on some cases only, unless `full`.
 
 A multibody run changes one setting of the shipped knee bend and is compared with the run as shipped
-at the same instants. A lower frame rate removes rows of the recordings (motion, shank and ground
-reaction), so the derivatives come from the remaining rows.
+at the same instants. A lower frame rate removes rows of the recordings, so the derivatives come
+from the remaining ones.
 """
 
 import json

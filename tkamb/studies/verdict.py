@@ -7,16 +7,10 @@ Each extreme case is tested in three ways:
   forces agree with the pressure map.
 - A stored result of CalculiX on the same hexahedra (C3D8I), if there is one (`peer_distances`). The
   elements differ, so the bounds are the largest measured differences, rounded up.
-Newton's method on the same grid, which shows errors of the solver alone.
+- Newton's method on the same grid, which shows errors of the solver alone.
 
-A closed form is tested with its formula. Accepted verdicts are stored. Kinds of verdict:
+A closed form is tested with its formula. docs/studies.md has the kinds of verdict.
 
-- converged: the status is ok, all checks pass, and the result is within 2 % of the reference in
-  approach, condyle force and peak pressure.
-- flagged: there is no result, or a result with a flag fails a check or differs too much.
-- unflagged_wrong: a result with status ok and no flag fails a check or differs too much.
-- unverified: the status is ok, but the reference did not converge. Counts as failed.
-- exception: an exception of a class that tkamb does not define.
 - hang: the model exceeds its limit of processor time.
 """
 

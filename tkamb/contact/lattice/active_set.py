@@ -23,10 +23,10 @@ class ContactForces:
     """Solution of the contact problem.
 
     Args:
-        force: lambda, N, shape (n,), >= 0.
-        gap: gamma, m, shape (n,), >= 0.
+        force: lambda, N, (n,), >= 0.
+        gap: gamma, m, (n,), >= 0.
         approach: D, m.
-        active: mask of the nodes in contact, shape (n,).
+        active: mask of the nodes in contact, (n,).
     """
 
     force: Array
@@ -48,10 +48,10 @@ def solve_contact(
     """Return forces, gaps and approach that fulfil the contact conditions.
 
     Args:
-        compliance: A, m/N, shape (n, n).
-        gap: gaps at zero force and approach, m, shape (n,).
+        compliance: A, m/N, (n, n).
+        gap: gaps at zero force and approach, m, (n,).
         load: force along -y, N; None if the approach is given.
-        active: initial guess of the nodes in contact, shape (n,).
+        active: initial guess of the nodes in contact, (n,).
         approach: m, used if the load is None.
 
     Raises:

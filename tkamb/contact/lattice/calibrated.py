@@ -7,9 +7,8 @@ the springs of the whole lattice are
     edges            k_x  = V/a² (3 - a²/b² - a²/c²) + 4 k_b a²/L², cyclic
     body diagonals   k_b, free between bounds
 
-A cell owns a quarter of each edge, half of each face diagonal and all of its body diagonals.
-A uniform strain then stores the energy of an isotropic solid with lambda = mu
-(docs/lattice.md). The deviatoric stiffness of a cell of any shape is
+A uniform strain then stores the energy of an isotropic solid with lambda = mu (docs/lattice.md has
+all equations). The deviatoric stiffness of a cell of any shape is
 
     K_d = V B̄ᵀ (2 I_dev) B̄ + Pᵀ K_spr P
 
@@ -244,8 +243,8 @@ def softened_forces(
 
     Args:
         shear_modulus: mu, Pa.
-        knots: equivalent strains between which 3 mu_s e is cubic, shape (q,).
-        cubic: its coefficients, the highest power first, shape (4, q - 1).
+        knots: equivalent strains between which 3 mu_s e is cubic, (q,).
+        cubic: its coefficients, the highest power first, (4, q - 1).
         least: smallest e that is distinguished from zero.
     """
     u, b, force = np.empty((3, 8)), np.empty((2, 12)), np.empty((3, 8))
@@ -286,9 +285,9 @@ def cell_forces(
 
     Args:
         bulk_modulus: K, Pa.
-        sizes: overwritten by the norm of (mu - mu_s) K_d u of each cell, N, shape (c,). The linear
-            solid carries this force in excess.
-        internal: nodal forces, N, shape (n, 3). mu_s K_d u + K V g (g · u) of the cells is added.
+        sizes: overwritten by the norm of (mu - mu_s) K_d u of each cell, N, (c,). The linear solid
+            carries this force in excess.
+        internal: nodal forces, N, (n, 3). mu_s K_d u + K V g (g · u) of the cells is added.
     """
     u, b, force = np.empty((3, 8)), np.empty((2, 12)), np.empty((3, 8))
     tangent_work = 0.0
@@ -319,7 +318,7 @@ def spring_families(edges: Array, body_diagonal: float) -> Array:
     """Return a cell's own part (28,) of its springs' stiffness, m per unit shear modulus.
 
     Args:
-        edges: a, b, c, m, shape (3,).
+        edges: a, b, c, m, (3,).
         body_diagonal: k_b, m per unit shear modulus.
     """
     square, volume = edges**2, np.prod(edges)

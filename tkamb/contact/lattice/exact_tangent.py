@@ -15,7 +15,7 @@ displacement. With S = (1 - C lambda G)⁻¹ C, dlambda solves
 The active set is constant: where a node comes into contact, the derivative is one-sided. For a
 translation w, dH = m . w and dn = -G w; else dH and dn are central differences of the surface.
 
-The active set is constant: where a node comes into contact, the derivative is one-sided.
+`tkamb.contact.lattice.probe` has a faster approximation.
 """
 
 from dataclasses import dataclass

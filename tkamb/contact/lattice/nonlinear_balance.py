@@ -1,7 +1,6 @@
 """Residual forces of the displaced solid, and the nonlinear loads h that make them vanish.
 
-The iteration uses the linear stiffness K. The loads h correct for the stress that the softened
-material lacks:
+K is the linear stiffness; the loads h correct for the stress that the softened material lacks:
 
     K u = f + h,    r = f - f_int(u)
 
@@ -11,7 +10,7 @@ Newton), accelerated by Anderson's method (Walker & Ni, SIAM J Numer Anal 49:171
 doi:10.1137/10078356X). The softening s is the ratio of secant and tangent stiffness along u, so
 that K/s approximates the tangent stiffness.
 
-An element's share of h grows with a power of its strain (4.5 for polyethylene). So passes evaluate
+An element's share of h grows with a power of its strain (4.5 for polyethylene), so passes evaluate
 only the `Region` of the largest shares. The other shares and the rounding error of the factor
 change little: they are measured with the whole solid (`NonlinearBalance.measure`), and constant
 until the next measurement.
@@ -155,7 +154,6 @@ class NonlinearBalance:
         """Compute the region's displacement and residual.
 
         Args:
-            force: forces on the candidates, N, (m, 3).
             displacement: candidates' displacement from the condensed compliance, m, (m, 3).
         """
         operator, region, solid = self._problem.operator, self._region, self._problem.solid

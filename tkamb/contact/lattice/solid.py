@@ -1,7 +1,7 @@
 """A solid made of cells, and its material law as a secant shear modulus mu_s.
 
-The law is J2 deformation theory with an elastic bulk. Under uniaxial stress sigma the strain is
-eps = e + sigma/(9 K), with the equivalent deviatoric strain e and the bulk modulus K. Therefore
+The law is J2 deformation theory with an elastic bulk. Under uniaxial stress sigma the strain is eps
+= e + sigma/(9 K), with the equivalent deviatoric strain e and the bulk modulus K, so
 
     q(e) = sigma(eps),   e = eps - sigma(eps)/(9 K),   3 mu_s = q(e)/e
 

@@ -9,12 +9,11 @@ approach D with
 
 f_int are the internal forces of the displaced solid under its nonlinear law, p the femoral points.
 A pass is a modified Newton step with the factorised linear stiffness K; docs/lattice.md ("Solver")
-has its steps: rays, active set (`active_set.py`), displacement K u = f + h, residual r = f -
-f_int(u) and next loads h + s r (`nonlinear_balance.py`).
+has its steps.
 
-Passes evaluate only the region of the softened elements; when its residual is within the
-tolerances, the whole solid is measured: r from the law of every element, without K, and the gap
-with new rays at the displaced nodes. The iteration has converged when
+Passes evaluate only the region of the softened elements. When its residual is within the
+tolerances, the whole solid is measured: r from the law of every element, and the gap with new rays
+at the displaced nodes. The iteration has converged when
 
     |r| / |f| <= force_tolerance
     s |r · u| / (f · u) <= work_tolerance,    s = (f_int(u) · u) / (uᵀ K_T u)
@@ -25,10 +24,8 @@ and the active set has stopped changing. The second residual estimates the relat
 approach, because an error du = e u leaves r = e K_T u. The load and lambda >= 0 hold to rounding in
 every pass.
 
-After `max_passes` an iteration that began with the loads of an earlier solution begins again
-without them; else `solve_by_newton` continues, whose steps factorise the tangent stiffness and
-solve the contact on its compliance. It is also the reference: only the contact conditions are
-shared.
+Else an iteration that began with the loads of an earlier solution begins again without them, or
+`solve_by_newton` continues (also the reference).
 """
 
 from dataclasses import dataclass, replace

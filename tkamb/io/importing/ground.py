@@ -319,7 +319,7 @@ def common_interval(
     the requested one.
 
     Args:
-        time: times of the motion, s, shape (n,).
+        time: times of the motion, s, (n,).
         interval: requested start and end, s; None: all of the motion.
         span: times of the ground reaction's first and last sample, s; None: the ground reaction
             is from the recording of the motion.

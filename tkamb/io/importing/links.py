@@ -4,7 +4,7 @@ Each link is a frame on a body of the model:
 
 - femur: origin of the femoral component's mesh, with the mesh axes turned to x anterior,
   y superior, z right. Without an implant: the knee's centre, with the axes of the femoral body.
-- tibia: the ankle joint's centre, with the axes of the tibial body.
+- tibia: the ankle joint's centre, with the tibial body's axes.
 - patella: the origin of the patella's body. Its axes are those of the body, turned by multiples
   of 90 deg so that they are nearest the axes of the femur link.
 """
@@ -34,7 +34,7 @@ class MeshFrame:
     """The frame of a mesh in a body of the model.
 
     Args:
-        pose: pose_mesh_in_body, shape (4, 4); None: at the body's origin, with anatomical axes.
+        pose: pose_mesh_in_body, (4, 4); None: at the body's origin, with anatomical axes.
         why: words on how the frame was identified, for the report.
     """
 
@@ -104,7 +104,6 @@ class Links:
 
     Args:
         patella: pose of the patella link; None without a patella.
-        insert_in_tibia: pose of the insert frame in the tibia link.
         button_in_patella: pose of the button's mesh, turned to anatomical axes, in the patella
             link; None without a button.
         patella_error: angle between the axes of the patella link and the femur link in the neutral
@@ -172,7 +171,7 @@ def find_links(
 
     Args:
         placement: pose of the insert's mesh in the insert frame, after the mesh is turned to
-            anatomical axes about its origin, shape (4, 4); None without an implant.
+            anatomical axes about its origin, (4, 4); None without an implant.
         axes: axes of the meshes that point anterior, superior and right.
         frames: part of the implant -> name of its mesh's frame; None: inferred from the names.
     """

@@ -21,11 +21,11 @@ class ModelSegment:
 
     Args:
         name: "shank", "thigh", "foot" or "pelvis".
-        points: label in the recording -> position of the marker, m, shape (3,), in the link of
-            shank or thigh, or in the body of foot or pelvis.
+        points: label in the recording -> position of the marker, m, (3,), in the link of shank or
+            thigh, or in the body of foot or pelvis.
         missing: names of the model's markers that are not visible in the recording.
         joined_to: neighbouring segment: "shank" for the foot, "thigh" for the pelvis, else "".
-        joint: ball joint with the neighbouring segment, in the link of that segment, m, shape (3,).
+        joint: ball joint with the neighbouring segment, in the link of that segment, m, (3,).
         centre: the same ball joint in the body of foot or pelvis, m, (3,).
     """
 

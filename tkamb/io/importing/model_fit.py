@@ -90,9 +90,9 @@ class ModelChain:
         is neglected.
 
         Args:
-            state: coordinates, rad and m, shape (f, n).
-            target: measured positions p of the markers, m, shape (f, m, 3).
-            weights: weights w of the squared distances, shape (f, m).
+            state: coordinates, rad and m, (f, n).
+            target: measured positions p of the markers, m, (f, m, 3).
+            weights: weights w of the squared distances, (f, m).
         """
         poses, twists = self.kinematics.joint_twists(state)
         twists = twists[:, self._moving]
@@ -119,7 +119,7 @@ class ModelChain:
         """Return the equations of the free coordinates, at a state (f, n).
 
         Args:
-            twists: twists of the moving coordinates, shape (f, k, 6).
+            twists: twists of the moving coordinates, (f, k, 6).
             sums: sums over the markers that each coordinate moves, (f, k, 25).
             cost: weighted sum of squared distances, m², (f,).
         """

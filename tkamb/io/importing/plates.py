@@ -249,9 +249,9 @@ class Feet:
     """Positions of the feet.
 
     Args:
-        time: times, s, shape (n,).
-        middles: side -> mean position of the foot's markers in the laboratory, m, shape (n, 3);
-            NaN where no marker is visible.
+        time: times, s, (n,).
+        middles: side -> mean position of the foot's markers in the laboratory, m, (n, 3); NaN where
+            no marker is visible.
     """
 
     path: Path

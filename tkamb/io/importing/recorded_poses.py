@@ -52,8 +52,8 @@ class ModelMotion:
     """Motion of knee and shank.
 
     Args:
-        time: times, s, shape (n,).
-        values: values of `COLUMNS`, mm and deg, shape (n, 12).
+        time: times, s, (n,).
+        values: values of `COLUMNS`, mm and deg, (n, 12).
         missing: coordinates of the model that the file lacks. They have their default values.
     """
 
@@ -143,9 +143,9 @@ class JointCentre:
     """A joint centre that stands for a marker of the shank.
 
     Args:
-        markers: label of a marker of the neighbouring segment -> its place there, m, shape (3,).
-        place: the centre in the same frame, m, shape (3,).
-        in_tibia: the centre in the tibia link, m, shape (3,).
+        markers: label of a marker of the neighbouring segment -> its place there, m, (3,).
+        place: the centre in the same frame, m, (3,).
+        in_tibia: the centre in the tibia link, m, (3,).
     """
 
     markers: Mapping[str, Array]
@@ -159,7 +159,7 @@ class ShankMarkers:
 
     Args:
         axes: axes of the file that point forward, up and right.
-        points: label of a marker -> its position in the tibia link, m, shape (3,).
+        points: label of a marker -> its position in the tibia link, m, (3,).
     """
 
     path: Path
@@ -184,8 +184,7 @@ def shank_markers(
 
     Args:
         segments: segment -> its visible markers.
-        femur: poses of the femur's body in the tibia link, m, shape (n, 4, 4).
-        axes: axes of the file that point forward, up and right.
+        femur: poses of the femur's body in the tibia link, m, (n, 4, 4).
     """
     points = segments["shank"].points
     centres: dict[str, JointCentre] = {}
@@ -282,9 +281,9 @@ class RecordedPoses:
 
     Args:
         interval: start and end of the part to compute, s; None: the whole recording.
-        time: times in the recording of markers, s, shape (n,).
-        femur: poses of the femur's body in the tibia link, m, shape (n, 4, 4).
-        in_stance: mask of the poses with a loaded foot, shape (n,).
+        time: times in the recording of markers, s, (n,).
+        femur: poses of the femur's body in the tibia link, m, (n, 4, 4).
+        in_stance: mask of the poses with a loaded foot, (n,).
     """
 
     given: PoseRecording
@@ -312,7 +311,6 @@ def read_poses(
         insert: mesh of the insert about its own origin, in anatomical axes.
         axes: axes of the meshes that point anterior, superior and right.
         cutoff_Hz: cut-off frequency of the scene's low-pass filter, Hz.
-        interval: start and end of the part to compute, s; None: the whole recording.
     """
     turn = pose(axes_rotation(axes), np.zeros(3))
     placement = insert_placement(insert, axes_rotation(axes)) @ turn

@@ -1,17 +1,17 @@
 """Marker positions on the segments of a leg, found together with the motion of several trials.
 
-Where markers sit on the bones is rarely measured. The motion shows it: hip, knee and ankle are
-joints, so that a marker in the wrong place disagrees with the others in many frames. With the
-measured markers p, the pose q of the leg in each frame and the parameters θ (positions of the
-markers, shifts of hip and ankle in thigh and shank, mean offset of the knee from the model's),
+Hip, knee and ankle are joints, so that a marker in the wrong place disagrees with the others in
+many frames (docs/import.md). With the measured markers p, the pose q of the leg in each frame and
+the parameters θ (positions of the markers, shifts of hip and ankle in thigh and shank, mean offset
+of the knee from the model's),
 
     min_{q, θ}  Σ_frames [ Σ_m |x_m(q, θ) - p_m|² / σ_m² + Σ_i (k_i(q) - k̄_i - o_i)² / s_i² ] / c
                 + Σ_j (θ_j - θ̄_j)² / τ_j².
 
 The second sum keeps the knee a joint: its coordinates k other than flexion may leave the model's
 neutral values k̄ by a few millimetres and degrees. Gauss-Newton steps eliminate the frames (Schur's
-complement), with Pinocchio's Jacobians. σ_m follows from the residuals. Skin moves alike in each
-stride and slowly within it. c is therefore the number of frames per independent observation, and
+complement), with Pinocchio's Jacobians. σ_m follows from the residuals, and c is the number of
+frames per independent observation, because skin moves alike in each stride and slowly within it;
 the inverse of the reduced matrix is the covariance of θ.
 
 References: Reinbolt et al., J Biomech 38:621 (2005), doi:10.1016/j.jbiomech.2004.03.031; Andersen
@@ -98,7 +98,7 @@ class Registration:
         segments: the segments with the registered positions of markers and joints.
         residuals: "before" (with the model's positions) and "after" -> label -> root mean square
             residual of the rigid fit of its segment, m.
-        deviation: label -> deviation of its position, m, shape (3,).
+        deviation: label -> deviation of its position, m, (3,).
         prior: label -> deviation of its position by the model alone, m.
         noise: label -> its deviation σ about the fitted leg, m.
         joints: "hip" or "ankle" -> its shift in thigh or shank and the deviation, m, (3,) each.

@@ -196,11 +196,8 @@ class ImportRequest:
         scale_mass: whether the model's masses are scaled to the subject's mass.
         method: method of fitting the markers, "segments" or "chain".
         cutoff_Hz: cut-off frequency of the low-pass filter of markers and plates.
-        activity: activity whose published peaks the report shows; None: no peaks.
         prefix: prefix of the markers to use, if a label occurs with several prefixes.
         muscles: whether all muscles share the load, or only the quadriceps.
-        cycle: times of 0 and 100 % of the gait cycle, s; "plates": two foot strikes on the plates.
-        units: units that the user states because the file of the recording does not.
     """
 
     model: Path

@@ -99,8 +99,8 @@ def calibrated_markers(
 
     Args:
         table: markers and joints of the scene. Markers that the trial lacks are ignored.
-        pose_insert_in_tibia: pose of the insert frame in the tibia link, shape (4, 4), mirrored
-            for a left leg.
+        pose_insert_in_tibia: pose of the insert frame in the tibia link, (4, 4), mirrored for a
+            left leg.
     """
     labels = [column[:-2] for column in recorded.columns if column.endswith("_x")]
     points = [

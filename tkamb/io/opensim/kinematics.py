@@ -6,10 +6,9 @@ ground's origin (angular above linear velocity). Then a point p of the body has 
 
     ∂p/∂q = J_linear + J_angular × p.
 
-The twist of a joint's outboard body is that of the inboard body plus a term for each axis of the
-joint. A rotation by u(q) about the line through c along d adds (d, c × d) du/dq. A translation
-along d adds (0, d) du/dq. In a backwards joint, whose child is nearer to ground, the term has the
-opposite sign.
+The twist of a joint's outboard body is that of the inboard body plus a term for each axis: (d, c ×
+d) du/dq for a rotation by u(q) about the line through c along d, (0, d) du/dq for a translation. In
+a backwards joint, whose child is nearer to ground, the term has the opposite sign.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,11 +28,10 @@ class Motion:
 
     Args:
         bodies: body -> its index; ground is first.
-        poses: pose of each body in ground, shape (..., b, 4, 4).
-        twists: twist of each body at ground's origin, per unit of each coordinate, shape
-            (..., b, 6, n).
+        poses: pose of each body in ground, (..., b, 4, 4).
+        twists: twist of each body at ground's origin, per unit of each coordinate, (..., b, 6, n).
         axes: twist of the child frame relative to the parent frame, per unit of motion along each
-            joint axis, shape (..., a, 6).
+            joint axis, (..., a, 6).
     """
 
     bodies: dict[str, int]
@@ -45,7 +43,7 @@ class Motion:
         """Return positions of points on m named bodies in ground, and their derivatives.
 
         Args:
-            locations: points in the frames of their bodies, m, shape (m, 3) or (..., m, 3).
+            locations: points in the frames of their bodies, m, (m, 3) or (..., m, 3).
 
         Returns:
             Positions (..., m, 3), m, and their derivatives ∂p/∂q (..., m, 3, n).

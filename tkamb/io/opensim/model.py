@@ -268,8 +268,8 @@ class Body:
     """A rigid body.
 
     Args:
-        centre: centre of mass in the body's frame, m, shape (3,).
-        inertia: inertia tensor about the centre of mass, kg·m², shape (3, 3).
+        centre: centre of mass in the body's frame, m, (3,).
+        inertia: inertia tensor about the centre of mass, kg·m², (3, 3).
     """
 
     name: str
@@ -284,8 +284,6 @@ class Coordinate:
 
     Args:
         rotational: whether the coordinate is an angle. Files "in degrees" state it in degrees.
-        clamped: whether OpenSim restricts the coordinate to the range.
-        locked: whether OpenSim fixes the coordinate at its default.
     """
 
     name: str
@@ -320,8 +318,8 @@ class Joint:
 
     Args:
         kind: the file's class, such as "PinJoint".
-        pose_parent_frame: pose of the parent frame in the parent body, shape (4, 4).
-        pose_child_frame: pose of the child frame in the child body, shape (4, 4).
+        pose_parent_frame: pose of the parent frame in the parent body, (4, 4).
+        pose_child_frame: pose of the child frame in the child body, (4, 4).
         backwards: whether the child body is nearer to ground than the parent body.
         unread: reason for which the joint's motion could not be read. Such a joint is welded.
             "": the motion was read.
@@ -382,11 +380,7 @@ class Marker:
 
 @dataclass(frozen=True)
 class Unread:
-    """An element of the file that could not be read.
-
-    Args:
-        kind: the file's class.
-    """
+    """An element of the file that could not be read."""
 
     kind: str
     name: str
@@ -404,8 +398,8 @@ class OpenSimModel:
     """Units are SI.
 
     Args:
-        gravity: acceleration of gravity in ground, m/s², shape (3,). It is along -y: the file's
-            ground is turned upright when the file is read.
+        gravity: acceleration of gravity in ground, m/s², (3,). It is along -y: the file's ground is
+            turned upright when the file is read.
         bodies: name -> body, without ground.
         joints: the joints, ordered from ground outwards.
         coordinates: name -> coordinate, in the file's order. Every vector q has this order.

@@ -6,9 +6,9 @@ generalised forces are
 
     τ = Σ_b J_bᵀ (dh_b/dt - (c × m g, m g) - w_b).
 
-Accelerations are computed from ground outwards. A joint axis s with the angle or translation u(q)
-adds s ü + (v × s) u̇. Here v is the twist of the previous body or axis, and × is the cross product
-of twists. Within a joint, the translations precede the rotations.
+Accelerations are computed from ground outwards: a joint axis s with the angle or translation u(q)
+adds s ü + (v × s) u̇, with the twist v of the previous body or axis and the cross product × of
+twists. Within a joint, the translations precede the rotations.
 
 Reference: Featherstone, Rigid Body Dynamics Algorithms (2008), chapters 2 and 5.
 """
@@ -38,11 +38,11 @@ def inverse_dynamics(
     Every coordinate counts as independent, without constraints and couplers.
 
     Args:
-        q: coordinates, rad and m, shape (f, n).
+        q: coordinates, rad and m, (f, n).
         rates: first time derivatives, (f, n).
         accelerations: second time derivatives, (f, n).
         wrenches: body -> moment (N·m) above force (N) on the body, in ground at ground's origin,
-            shape (f, 6), for example the ground reaction on a foot.
+            (f, 6), for example the ground reaction on a foot.
     """
     motion = kinematics.motion(q)
     needed = required_wrenches(kinematics, motion, q, rates, accelerations, wrenches)
@@ -127,8 +127,8 @@ class CoordinateMotion:
     """Coordinates over time, in the model's order.
 
     Args:
-        time: times, s, shape (f,).
-        q: coordinates, rad and m, shape (f, n).
+        time: times, s, (f,).
+        q: coordinates, rad and m, (f, n).
         rates: first time derivatives, per s, (f, n).
         accelerations: second time derivatives, per s², (f, n).
     """
@@ -231,10 +231,10 @@ def coordinate_motion(
     c'' = f' q'' + f'' q'².
 
     Args:
-        time: times of the samples, s, shape (m,).
+        time: times of the samples, s, (m,).
         q: coordinates, rad and m, (m, n). Values of dependent coordinates are ignored.
         cutoff_Hz: cut-off frequency, Hz, as in `differentiate_coordinates`.
-        at: times of the result, s, shape (f,); None: `time`.
+        at: times of the result, s, (f,); None: `time`.
     """
     values, rates, second = differentiate_coordinates(time, q, cutoff_Hz, at, name=name)
     for coupler in kinematics.model.couplers:

@@ -43,9 +43,9 @@ class Lines:
 
     Args:
         names: names of the m muscles or ligaments.
-        lengths_m: lengths, shape (..., m); NaN if no taut string was found.
-        moment_arms: -dL/dq, m per rad or m per m, shape (..., m, n), with the coordinates in the
-            model's order.
+        lengths_m: lengths, (..., m); NaN if no taut string was found.
+        moment_arms: -dL/dq, m per rad or m per m, (..., m, n), with the coordinates in the model's
+            order.
     """
 
     names: tuple[str, ...]
@@ -59,7 +59,7 @@ class Pulls(Lines):
 
     Args:
         wrenches: moment (N·m per N) above force (N per N) on each group, in ground at ground's
-            origin, shape (..., m, g, 6).
+            origin, (..., m, g, 6).
         crossings: straight parts between different groups. Their `bodies` are indices of groups;
             -1 means a body outside all groups.
     """

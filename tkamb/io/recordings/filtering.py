@@ -4,18 +4,16 @@ The filter is the quintic smoothing spline: the function s that minimises
 
     sum_i w_i (x_i - s(t_i))^2 + lambda * integral (s''')^2 dt,     lambda = (2 pi f_c)^-6
 
-with w_i the spacing of the samples. Away from the ends its frequency response is
-1 / (1 + (f / f_c)^6), that of a third-order Butterworth filter run forwards and backwards: one half
-at the cut-off f_c, no phase shift. Unlike that filter, it accepts uneven samples, and its first and
-second derivatives belong to one smooth curve. Polynomials of degree two pass unchanged.
+with w_i the spacing of the samples. Away from the ends its frequency response is 1 / (1 + (f /
+f_c)^6), that of a third-order Butterworth filter run forwards and backwards: one half at the
+cut-off f_c, no phase shift. Unlike that filter, it accepts uneven samples, and its first and second
+derivatives belong to one smooth curve.
 
-The ends are natural; samples are not padded. Example: a 1 Hz wave with a cut-off of 6 Hz. The root
-mean square error of its acceleration, as a share of the amplitude, is 0.23 at an end. At a distance
-of a quarter, a half and one period of the cut-off it is 0.06, 0.013 and 0.002. A two-pass
-Butterworth filter with reflected ends has errors of 0.64, 0.16, 0.11 and 0.02 at these places.
-
-`periodic=True` closes the curve: the last sample is the first one of the next cycle, and there are
-no ends.
+The ends are natural, without padding, unless `periodic=True` closes the curve: the last sample is
+then the first one of the next cycle. Example, a 1 Hz wave with a cut-off of 6 Hz: the root mean
+square error of its acceleration, as a share of the amplitude, is 0.23 at an end, and 0.06, 0.013
+and 0.002 at a quarter, a half and one period of the cut-off from it. A two-pass Butterworth filter
+with reflected ends has 0.64, 0.16, 0.11 and 0.02.
 
 `cutoff_Hz = "none"` interpolates the samples with a quintic spline.
 
@@ -24,8 +22,8 @@ References:
     Craven & Wahba, Numer Math 31:377 (1979), doi:10.1007/BF01404567.
 
 The deviation of a sample is its distance from the cubic through its two neighbours on either side.
-A sample is odd if its deviation exceeds `floor` and many times the median deviation around it.
-Noise is therefore not odd: it raises the median, which a single odd sample hardly changes.
+It is odd if it exceeds `floor` and many times the median deviation around it: noise raises this
+median, a single odd sample hardly changes it.
 """
 
 import math
@@ -105,10 +103,8 @@ def differentiate_poses(
         omega = 2 vec(s* s') / |s|^2,   alpha = 2 vec(s* s'') / |s|^2 - 2 omega (s . s') / |s|^2
 
     Args:
-        time: (n,) s.
-        poses: (n, 4, 4) pose_body_in_world, m.
-        cutoff_Hz: frequency at which the amplitude is halved, or "none".
-        at: (f,) s, times of the result, within `time`; default: `time`.
+        poses: (n, 4, 4) pose_body_in_world, m. The other arguments are those of
+            `differentiate_coordinates`.
 
     Returns:
         Poses (f, 4, 4), spatial velocity (f, 6) and spatial acceleration (f, 6). Both are linear,

@@ -19,8 +19,8 @@ plate are then used.
 ORIGIN is the vector o from the transducers' origin to the surface's centre, about which the moment
 is M - o × F.
 
-FORCE_PLATFORM:ZERO names frames without load. The mean of each channel over these frames is
-subtracted, unless the plate is loaded in them.
+The mean of each channel over the frames of FORCE_PLATFORM:ZERO is subtracted, unless the plate is
+loaded in them.
 
 Source: C3D user guide, FORCE_PLATFORM; Kistler's formulae for four three-component sensors.
 
@@ -231,14 +231,11 @@ def force_plate(record: PlateRecord) -> ForcePlate:
 def _in_possible_unit(
     record: PlateRecord, force: Array, moment: Array
 ) -> tuple[Array, Array, tuple[str, ...]]:
-    """Return force and moment in the unit that puts the centre of pressure on the plate.
+    """Return force and moment in the unit that puts the centre of pressure on the plate; arguments
+    as in `pressure_range`.
 
     Another unit than the file's is used, with a notice, only if that is impossible and exactly one
     other is possible. The user's unit is kept.
-
-    Args:
-        force: (k, 3) N, as stated, in the plate's axes.
-        moment: (k, 3) N·m about the surface's centre, as stated, in the plate's axes.
     """
     stated = pressure_range(record.corners, force, moment, _above_transducers(record))
     if stated is None or not (stated.beside or stated.resting):

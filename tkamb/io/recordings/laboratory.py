@@ -47,12 +47,8 @@ _SEPARATORS = str.maketrans("", "", " .*-·⋅_\x00\t")
 
 @dataclass(frozen=True)
 class GivenUnits:
-    """Units that the user states; None: those of the recording.
-
-    Args:
-        length: unit of markers and plates, like mm.
-        force: unit of force channels, like N.
-        moment: unit of moment channels, like Nmm.
+    """Units that the user states for lengths, force channels and moment channels, like mm, N and
+    Nmm; None: those of the recording.
     """
 
     length: str | None = None

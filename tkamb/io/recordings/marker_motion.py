@@ -2,12 +2,10 @@
 
 Both fits are computed, and the scene chooses one:
 
-- segments: shank and thigh are fitted rigidly and separately. Each segment gives a knee
-  centre. The distance between the two centres shows the movement of the skin.
-- chain: shank, knee, thigh and their neighbours are fitted at once, connected by joints. The
-  movement of the skin is distributed over the segments.
-
-The distance between the two knee centres is a lever arm that changes the moments of the knee.
+- segments: shank and thigh are fitted separately, each with a knee centre. The distance of the
+  centres shows the movement of the skin; it is a lever arm that changes the moments of the knee.
+- chain: shank, knee, thigh and their neighbours are fitted at once, so that the movement of the
+  skin is distributed over them.
 """
 
 from dataclasses import dataclass

@@ -125,7 +125,6 @@ def fit_seen(points: Array, reference: Array, weights: Array, name: str) -> tupl
 
     Args:
         points: (n, m, 3) m, gaps NaN.
-        reference: (m, 3) m.
         weights: (m,) weights of the squared distances.
 
     Returns:
@@ -185,7 +184,6 @@ def complete_run(
     """Return the longest range of frames around [start, end] in which no marker is missing.
 
     Args:
-        points: (n, m, 3), gaps NaN.
         start: start of the interval, s, which lasts to `end`.
     """
     first = int(np.searchsorted(time, start + 1e-9, side="right")) - 1

@@ -7,8 +7,8 @@ the low-pass multiplies each frequency f by
 
     1 / (1 + r⁴),  r = tan(pi f h) / tan(pi f_c h),
 
-and the high-pass by r⁴ / (1 + r⁴). The signal is mirrored at its ends, so that the low-pass also
-averages at the ends.
+and the high-pass by r⁴ / (1 + r⁴). The signal is mirrored at its ends, so that the low-pass
+averages there, too.
 
 Reference: Winter, Biomechanics and Motor Control of Human Movement, 4th ed., 2009, ch. 10.
 """

@@ -74,8 +74,6 @@ class MeshHealth:
         extents: lengths along the mesh's x, y and z.
         bodies: the separate bodies after repair of small defects, with the largest surface
             first; a void belongs to the body around it.
-        watertight: whether the mesh in the file is closed.
-        closed_after_repair: whether the mesh is closed after repair of small defects.
         holes: loops of open edges in the file, widest first.
         remaining_holes: holes that loading would not close.
         forks: number of vertices on edges at which three or more sheets meet.

@@ -3,9 +3,9 @@
 Required links: `tibia` (shank and foot, its origin at the ankle centre), `femur`, `patella`, and
 `hip`, a frame fixed to the femur at the hip centre. Required joints: `ankle` (or the tibia as
 root), the six single-axis knee joints of `tkamb.io.recordings.urdf_check` in their order, and the
-three joints of the patella. The origin of `knee_ap` is the insert frame in the tibia. The frame of
-the femur link is the frame of the femoral component. Other links that are fixed to these may hold
-attachment points.
+three joints of the patella. The origin of `knee_ap` is the insert frame in the tibia, the femur
+link's frame that of the femoral component. Other links that are fixed to these may hold attachment
+points.
 
 Links without inertia get the segment inertias of de Leva, J Biomech 29:1223 (1996),
 doi:10.1016/0021-9290(95)00178-6, with the shank from the knee to the ankle joint centre.

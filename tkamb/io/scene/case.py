@@ -59,8 +59,8 @@ class Case:
         ligaments: the bundles, including generic ones; the slack length is NaN if the scene does
             not state it.
         post: the insert's post in the insert frame, if the scene has [contact] post.
-        insert_placement: pose of the insert's mesh in the insert frame, after the mesh is turned
-            to anatomical axes about its origin, not mirrored, m, shape (4, 4); None if not needed.
+        insert_placement: pose of the insert's mesh in the insert frame, after the mesh is turned to
+            anatomical axes about its origin, not mirrored, m, (4, 4); None if not needed.
     """
 
     scene: Scene
@@ -92,8 +92,8 @@ class Case:
         """Filter coordinates of the patella like recorded ones, and differentiate them twice.
 
         Args:
-            time: times, s, shape (n,).
-            places: coordinates of the patella, shape (n, 3).
+            time: times, s, (n,).
+            places: coordinates of the patella, (n, 3).
         """
         cutoff = self.scene.motion.cutoff_Hz
         check_frames(self.motion.time, cutoff, self.scene.motion.frames)

@@ -26,7 +26,6 @@ def seated_motion(
     Args:
         motion: recorded motion; `motion.unrecorded` names the missing coordinates.
         femoral: femoral component, femoral frame.
-        insert: insert, insert frame.
         cutoff: cut-off frequency of the low-pass filter, Hz.
     """
     places = motion.coordinates.copy()
@@ -62,10 +61,7 @@ def rolling_motion(
     differentiated like recorded coordinates, but never as a closed cycle.
 
     Args:
-        femoral: femoral component, femoral frame.
-        insert: insert, insert frame.
         slip_share: share of the recorded motion's mean slip of the condyles; 0 is pure rolling.
-        cutoff: cut-off frequency of the low-pass filter, Hz.
     """
     split = condyle_split(femoral)
     recorded = condyle_slip(femoral, insert, split, motion.coordinates)

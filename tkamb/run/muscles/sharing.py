@@ -1,7 +1,7 @@
 """Static optimisation: the muscle activations of least cost for the joint moments of one frame.
 
-For given muscle activations a (n,), the equations of motion are a square system for the other
-unknowns y (m,), here the reserves. y is therefore affine in a:
+For given activations a (n,), the equations of motion are a square system for the other unknowns y
+(m,), here the reserves, and y is affine in a:
 
     A_d y + A_f F a = b     =>     y = offset + gain a,
     offset = A_d^-1 b,      gain = -A_d^-1 A_f F
@@ -12,9 +12,9 @@ with the muscle forces F at a = 1, N. The activations
     subject to lowest_i <= a_i <= highest_i,   lower_j <= y_j <= upper_j.
 
 The weights w are the muscles' relative volumes or 1. A reserve of size r costs as much as a fully
-active muscle of weight 1; r = inf means no cost. EMG gives activations e with standard deviations
-s; s = inf means no EMG. For p = 2 the problem is one strictly convex quadratic programme. For p > 2
-it is solved by a sequence of quadratic programmes (Newton's method).
+active muscle of weight 1 (inf: nothing). EMG gives activations e with standard deviations s (inf:
+no EMG). For p = 2 this is one strictly convex quadratic programme, for p > 2 a sequence of them
+(Newton's method).
 
 References: Crowninshield & Brand, J Biomech 14:793 (1981), doi:10.1016/0021-9290(81)90035-X;
 Arnstrom et al., IEEE Trans Autom Control 67:4362 (2022), doi:10.1109/TAC.2022.3176430 (DAQP).
@@ -252,7 +252,6 @@ class EmgGuide:
     Args:
         envelope: normalised envelopes, (f, m); NaN for muscles without EMG.
         use: "target" or "bounds".
-        size: weight W or width.
     """
 
     envelope: Array

@@ -28,9 +28,9 @@ class PressureMap:
     """The pressure on the insert at one frame.
 
     Args:
-        points: map points in the insert frame, m, shape (n, 3).
-        triangles: point numbers of the triangles between them, shape (k, 3).
-        pressure: contact pressure at the points, Pa, shape (n,).
+        points: map points in the insert frame, m, (n, 3).
+        triangles: point numbers of the triangles between them, (k, 3).
+        pressure: contact pressure at the points, Pa, (n,).
     """
 
     frame: int
@@ -221,10 +221,10 @@ class Group:
 
     Args:
         labels: axis of the cohort -> label that the runs share.
-        edges: edges of the b bins, in the unit of the axis, shape (b + 1,).
-        bins: column -> mean of each run in each bin, shape (r, b); NaN for a bin without frames.
-        peaks: column -> largest value of each run, shape (r,).
-        wear: name -> wear result of each run, shape (r,); empty if wear was not computed.
+        edges: edges of the b bins, in the unit of the axis, (b + 1,).
+        bins: column -> mean of each run in each bin, (r, b); NaN for a bin without frames.
+        peaks: column -> largest value of each run, (r,).
+        wear: name -> wear result of each run, (r,); empty if wear was not computed.
     """
 
     labels: dict[str, str]

@@ -54,7 +54,7 @@ class Articulation:
         """Return the smallest vertical gap under a condyle, mm, and the insert point (3,) there.
 
         Args:
-            pose: pose_femoral_in_insert, mm, shape (4, 4).
+            pose: pose_femoral_in_insert, mm, (4, 4).
             flexion: flexion, rad; the search begins at this angle of the femoral normal.
         """
         phi, z = flexion, side * self.femoral.ridge_half

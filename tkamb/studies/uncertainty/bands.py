@@ -1,4 +1,8 @@
-"""Bands of the results over the samples, and the share of each input in their variance."""
+"""Bands of the results over the samples, and the share of each input in their variance.
+
+`values` (n, m, f) are those of n samples, m columns of results.csv and f frames, NaN if missing.
+`failed` (n, f) marks the failed frames of the samples, and `body_weight` is in N.
+"""
 
 import re
 import warnings
@@ -75,9 +79,7 @@ def peak_band(nominal: Array, values: Array, failed: np.ndarray) -> dict[str, An
     """Return the band of a result at the frame of its largest nominal value.
 
     Args:
-        nominal: nominal values of the result, (f,).
-        values: values of the samples, (n, f); NaN for a missing value.
-        failed: whether each frame of each sample failed, (n, f).
+        nominal: nominal values of the result, (f,); here `values` are (n, f).
 
     Returns:
         Frame, nominal value, number of samples and of failed samples, median, p05 and p95 (None:
@@ -125,8 +127,6 @@ def band_columns(
 
     Args:
         time: s, (f,).
-        values: values of the samples, (n, m, f).
-        failed: whether each frame of each sample failed, (n, f).
     """
     columns = {"time_s": time, "failed_share": failed.mean(axis=0)}
     solved = np.maximum((~failed).sum(axis=0), 1)
@@ -146,7 +146,6 @@ def unbalanced_patella(
     """Return how often a recorded patella is not in equilibrium with its lines, by `status`.
 
     Args:
-        values: values of the samples, (n, m, f).
         body_weight: body weight, N.
 
     Returns:
@@ -174,10 +173,6 @@ def discrepancy_columns(
 
     There are none if the run's discrepancy is unknown. Values are NaN where the force or the total
     force has no band.
-
-    Args:
-        values: values of the samples, (n, m, f).
-        body_weight: body weight, N.
     """
     discrepancy = discrepancy_of(summary)
     totals = [name for name in TOTALS_N if name in names]
@@ -267,7 +262,6 @@ def influences(
 
     Args:
         results: names of the m results.
-        values: values of the samples, (n, m, f); NaN for a missing value.
         errors: errors of the inputs in standard deviations, (n, f, d).
 
     Reference: Li et al., J Phys Chem A 114:6022 (2010), doi:10.1021/jp9096919.

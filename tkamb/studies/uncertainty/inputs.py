@@ -3,9 +3,8 @@
 Sample n does not depend on the number of samples, so a larger number includes a smaller one.
 
 Correlated inputs ([[uncertainty.correlation]]) are z = L x, with x independent standard normal and
-L L^T the correlation matrix (Cholesky). This is a Gaussian copula, because every input is a
-function of one normal error. The method of Iman & Conover (1982) would make a sample depend on the
-number of samples.
+L L^T the correlation matrix (Cholesky). This is a Gaussian copula; the method of Iman & Conover
+(1982) would make a sample depend on the number of samples.
 
 References: Cario & Nelson, Modeling and generating random vectors with arbitrary marginal
 distributions and correlation matrix, Northwestern University (1997); Iman & Conover, Commun Stat
@@ -407,7 +406,6 @@ def noise(number: int, time: Array, dimensions: int, correlation_time: float, se
     The noise is stationary for any time steps.
 
     Args:
-        time: increasing times of the frames, s, (f,).
         correlation_time: correlation time tau, s; 0: white noise.
     """
     draws = np.random.default_rng([seed, NOISE, number]).standard_normal((len(time), dimensions))

@@ -4,8 +4,8 @@ Errors are applied to the loaded case, in SI units and for a right knee: only a 
 the insert needs a new preparation of the contact.
 
 Each skin marker is displaced on its segment by an error that is constant over the frames. The rigid
-fit of the displaced markers to the nominal ones is the error of the segment's pose
-(`method = "segments"`). A kinematic chain distributes the same errors over more segments.
+fit of the displaced markers to the nominal ones is the error of the segment's pose (`method =
+"segments"`), which a kinematic chain distributes over more segments.
 """
 
 from collections.abc import Sequence
@@ -294,10 +294,10 @@ class Sample:
     """Results of one sample.
 
     Args:
-        values: values of the requested columns, shape (names, frames); NaN if a frame failed or has
-            no value.
-        problems: reason why each frame failed, "" if it did not, shape (frames,).
-        errors: errors of the inputs in standard deviations, shape (frames, d).
+        values: values of the requested columns, (names, frames); NaN if a frame failed or has no
+            value.
+        problems: reason why each frame failed, "" if it did not, (frames,).
+        errors: errors of the inputs in standard deviations, (frames, d).
     """
 
     values: Array

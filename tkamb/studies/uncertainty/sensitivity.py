@@ -59,10 +59,9 @@ def sobol_indices(
 
     Args:
         results: names of the m results.
-        values: values of the samples, shape (n (d + 2), m, f), in the order of
+        values: values of the samples, (n (d + 2), m, f), in the order of
             `tkamb.studies.uncertainty.inputs.crossed_points`.
         count: number n of rows of the design.
-        seed: seed of the bootstrap.
 
     References:
         Saltelli et al., Comput Phys Commun 181:259 (2010), doi:10.1016/j.cpc.2009.09.018;

@@ -1,8 +1,8 @@
 """Nested dissection of a lattice, and multifrontal Cholesky factorisation on its tree.
 
-Only neighbouring nodes are joined, so a plane of nodes separates the nodes on its two sides. Such
-planes (separators) are eliminated last. The insert is wide and thin, so that planes across x and z
-are small separators (George, SIAM J Numer Anal 10:345, 1973, doi:10.1137/0710032).
+Only neighbouring nodes are joined, so a plane of nodes separates its two sides and is eliminated
+last; the insert is wide and thin, so that planes across x and z are small separators (George, SIAM
+J Numer Anal 10:345, 1973, doi:10.1137/0710032).
 
 Each tree member adds its rows and its children's updates to a dense front, eliminates its own
 unknowns and passes the update of the other unknowns to its parent (Duff & Reid, ACM TOMS 9:302,
@@ -436,7 +436,6 @@ def fronts_of(
         matrix: symmetric, positive definite on the unknowns that have a rank, (n, n).
         rank: place of each unknown in elimination order, (n,); -1 if it is excluded.
         starts: first place of each tree member, then the number of places, (f + 1,).
-        parent: index of each member's parent; -1 for a root.
         precision: type of the yielded fronts, which are computed in float64.
 
     Raises:

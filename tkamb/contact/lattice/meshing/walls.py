@@ -73,7 +73,6 @@ class Notch:
     Args:
         axes: the two axes of the squares.
         node: missing nodes; `first` and `second` are neighbours along these axes.
-        across: nodes across the diagonal.
     """
 
     axes: tuple[int, int]
