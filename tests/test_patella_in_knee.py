@@ -7,6 +7,7 @@ import pinocchio as pin
 import pytest
 
 import tkamb
+from equilibrium_cases import random_states
 from knee_bodies import whole_body
 from patella_bodies import HEADS, Z, body_knee, read_plane, symmetric
 from test_patella_body import energy
@@ -185,6 +186,19 @@ def test_knee_and_patella_are_in_equilibrium_together(plain, knee, released, fra
     residuals = found.loads.residuals
     if "ap" in released:
         assert max(map(abs, residuals.values())) <= 1e-5 * quadriceps
+
+
+def test_a_patella_on_a_jump_of_its_contact_has_an_equilibrium(plain, knee):
+    """The tension cannot agree to 1e-7 where the force of the button jumps from facet to facet."""
+    *_, jumping = random_states(plain, knee, False, 20)
+    found = jumping.equilibrium()
+    assert not found.failed, found.reason
+    quadriceps = found.loads.quadriceps
+    assert found.residual <= 1e-4 * quadriceps
+    alone = knee.patella_equilibrium(found.q, found.loads.tensions)
+    assert alone.residual <= 1e-4 * quadriceps
+    tension = found.search.geometry.extensor.released.tension
+    assert quadriceps == pytest.approx(tension, rel=1e-4)
 
 
 def test_the_pose_of_the_knee_and_the_patella_depend_on_each_other(plain, knee):

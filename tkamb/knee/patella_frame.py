@@ -9,8 +9,8 @@ the tibia with a wrench w_T(Q), and the patella passes the opposite wrench on to
 Heads, femoral retinacula and contact are internal to femur and patella. In the equations of the
 knee the extensor mechanism is therefore one unknown, Q, on the pair w_T/Q and w_F/Q. The equations
 give a tension f(Q) at the patella of Q. The search solves f(Q) - Q = 0 by the secant method, with
-the tension of the plane patella as first guess. The femur carries weight and inertia of the
-patella, up to 5 N.
+the tension of the plane patella as first guess, and returns the Q with the smallest difference. The
+femur carries weight and inertia of the patella, up to 5 N.
 """
 
 import time as clock
@@ -282,7 +282,7 @@ class PatellaMethod:
         Raises:
             ComputationError: the plane patella cannot be pressed, or a line has no path.
         """
-        began, last, change = clock.perf_counter(), None, np.inf
+        began, last, best = clock.perf_counter(), None, None
         probe = self.button.contact.probe()
         for _ in range(MAX_TENSIONS):
             body, balance = self.balanced(plane, tension, force, start, probe)
@@ -292,7 +292,7 @@ class PatellaMethod:
             on_knee = self._on_knee(plane, body, balance, force)
             if on_knee is None:
                 # Other lines hold the patella: a larger tension makes the strands taut.
-                tension, change = 2.0 * tension, np.inf
+                tension *= 2.0
                 continue
             trial, loads = solve(on_knee)
             if loads.problems:
@@ -301,6 +301,9 @@ class PatellaMethod:
                 return solve(plane)
             assert trial.extensor is not None
             change = trial.extensor.tension(loads.values) - tension
+            # Where the contact's force jumps, later tensions need not be closer.
+            if best is None or abs(change) < abs(best[0]):
+                best = change, trial, loads, body, balance
             if abs(change) <= TENSION_TOLERANCE * tension:
                 break
             slope = -1.0 if last is None else (change - last[1]) / (tension - last[0])
@@ -308,9 +311,10 @@ class PatellaMethod:
             step = -change / slope if slope < 0.0 else change
             # A step of more than half the tension leaves the range in which the slope holds.
             tension += float(np.clip(step, -0.5 * tension, tension))
-        if abs(change) > LARGEST_TENSION * tension:
+        if best is None or abs(best[0]) > LARGEST_TENSION * tension:
             words = "patella: the iteration of pose and tension does not converge"
             return plane, unsolved([complete_patella(body, balance).problem or words])
+        change, trial, loads, body, balance = best
         return self._complete(trial, body, balance, change, began), loads
 
     def head_tensions(self, tension: float) -> dict[str, float]:

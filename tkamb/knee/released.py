@@ -67,6 +67,10 @@ class ReleasedKneeSettings:
     tension_tolerance: float = 1e-7
     """1: change of the quadriceps' tension between passes, relative to it, below which passes with
     a released patella have converged."""
+    tension_jump: float = 1e-4
+    """1: change of this tension that may remain where it no longer falls from pass to pass: the
+    force of the button's contact jumps there from facet to facet. Equal to the largest difference
+    of two tensions at a recorded pose."""
     joint_residual: float = 1e-6
     """1: residual force on a released coordinate over the quadriceps' tension below which knee and
     released patella are in equilibrium together, if the quadriceps is the only muscle."""
@@ -198,6 +202,7 @@ class ReleasedKnee:
         knee, slack, trials, passes = before, False, 0, 0
         last_contact, relaxation, distances = None, Relaxation(), [np.inf, np.inf]
         pull = None if before is None else _pull(before.geometry)
+        change_of_pull = np.inf
         if instant.muscles and before:
             coordinates, last_contact = self._at_load(coordinates, before.contact)
         # The muscle forces of the last frame are a good guess only near the pose of their contact.
@@ -214,6 +219,7 @@ class ReleasedKnee:
                 stop_distance,
                 pull,
             )
+            last_change = change_of_pull
             pull, change_of_pull = self._next_pull(instant, knee, slack)
             last_contact = knee.contact
             passes, trials = passes + 1, trials + knee.balance.trials
@@ -240,7 +246,7 @@ class ReleasedKnee:
             elif knee.problem or (
                 relaxation.converged
                 and knee.balance.converged
-                and change_of_pull < RELEASED_KNEE.tension_tolerance
+                and _tension_has_converged(change_of_pull, last_change)
                 and remaining_distance(distances[-3:]) * distances[-1]
                 < RELEASED_KNEE.knee_tolerance
                 and remaining_distance(distances[-3:]) * change
@@ -550,6 +556,12 @@ def _pulled(
     return instant.patella.pulled(
         geometry, tension, patella.patellofemoral_ratio, start, complete=complete
     )
+
+
+def _tension_has_converged(change: float, last: float) -> bool:
+    """Return whether the tension has converged, by its relative change in the last two passes."""
+    stalls = 0.9 * last < change < RELEASED_KNEE.tension_jump
+    return stalls or change < RELEASED_KNEE.tension_tolerance
 
 
 def remaining_distance(distances: Sequence[float]) -> float:
