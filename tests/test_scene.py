@@ -66,6 +66,21 @@ def test_a_case_with_muscles_has_the_pose_of_the_inserts_mesh_without_contact():
     assert lowest == pytest.approx(0.0, abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("key", "words"),
+    [
+        ("ligament.0.slack_length_mm", "'ligament' is a list: .*; change it in the scene file"),
+        ("contact.model.name", "'contact.model' has no keys; `tkamb scene --schema` lists"),
+    ],
+)
+def test_an_override_below_a_list_or_a_value_is_refused_by_name(capsys, key, words):
+    with pytest.raises(InputError, match=words):
+        load_scene(MODEL / "scene.toml", {key: 1.0})
+    assert main(["check", str(MODEL / "scene.toml"), "--set", f"{key}="]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"tkamb: --set {key}: ")
+
+
 def test_an_override_wins_and_may_make_a_table(tmp_path):
     path = write_scene(tmp_path, ("contact",))
     scene = load_scene(path, {"contact.model": "hertz", "patient.mass_kg": 80})

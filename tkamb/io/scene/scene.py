@@ -294,12 +294,14 @@ def scene_schema() -> dict[str, Any]:
 
 def _override(content: dict[str, Any], dotted: str, value: Any) -> None:
     *tables, key = dotted.split(".")
-    for name in tables:
+    for k, name in enumerate(tables):
         content = content.setdefault(name, {})
         if not isinstance(content, dict):
-            raise InputError(
-                f"'{dotted}' names a key of something that is not a table", "overrides"
-            )
+            what, hint = "is a list: an option sets it as a whole", "change it in the scene file"
+            if not isinstance(content, list):
+                what, hint = "has no keys", "`tkamb scene --schema` lists every key"
+            table = ".".join(tables[: k + 1])
+            raise InputError(f"'{table}' {what}", f"overrides {dotted}", hint)
     content[key] = value
 
 
