@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _keep_to_one_thread() -> None:
     """Limit BLAS to one thread, unless the environment sets a number or NumPy is already loaded.
 
-    Memory bandwidth limits the lattice's solver; on a busy machine, several threads wait for each
+    Memory bandwidth limits the lattice's solver. On a busy machine, several threads wait for each
     other and take several times longer.
     """
     limits = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")

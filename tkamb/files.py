@@ -1,11 +1,11 @@
 """Reading of files with size limits; writing of files that are never incomplete.
 
-Reading: only regular files up to a size limit are read, because a FIFO would block for ever, a
-device has no end, and a table of gigabytes is not a recording.
+Reading: only regular files up to a size limit are read. A FIFO would block for ever, a device has
+no end, and a table of gigabytes is not a recording.
 
 Writing: a file is written under a temporary name in the same folder, then renamed, so that no link
 is followed. Files that belong together are all written first; then a journal lists them, and they
-are renamed. If the process is killed before the journal is written, the old files remain; if later,
+are renamed. If the process is killed before the journal is written, the old files remain. If later,
 the next command that writes into the folder finishes the renames (`finish_replacement`).
 """
 

@@ -1,7 +1,7 @@
 """Settings objects that differ from their defaults.
 
-A settings object is an instance of a frozen dataclass with a name that ends in `Settings`, at the
-top level of the module that uses it. Each field has a docstring with unit, meaning and origin.
+A settings object is an instance of a frozen dataclass with a name that ends in `Settings`. It is at
+the top level of the module that uses it. Each field has a docstring with unit, meaning and origin.
 `tkamb settings` lists all of them (`tkamb.commands.settings`).
 """
 

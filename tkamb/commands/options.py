@@ -1,7 +1,7 @@
 """Options that several commands share, rules that refuse options without effect, and examples.
 
-An option that would be ignored is refused, because the user expects an effect; `RULES` has the
-rules by command, and `tests/test_option_rules.py` checks that each option has an effect or a rule.
+An option that would be ignored is refused, because the user expects an effect. `RULES` has the
+rules by command; `tests/test_option_rules.py` checks that each option has an effect or a rule.
 """
 
 import argparse

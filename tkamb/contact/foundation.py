@@ -168,7 +168,7 @@ class ElasticFoundation(ContactModel):
         return press_by_search(self, state, load, pose, guess, unloaded=unloaded)
 
     def _load_out_of_range(self, nearby: "_NearColumns", load: float) -> bool:
-        """The reaction rises with the approach: all columns at the largest approach in range
+        """The reaction rises with the approach, so all columns at the largest approach in range
         decide.
         """
         if nearby.beyond - nearby.within > APPROACH_STEP:

@@ -143,6 +143,7 @@ class ProbedContact:
 
     Args:
         condyles: side -> wrench of that condyle; an unloaded condyle is absent.
+        known: False if the model is out of range or has not converged.
         tangent: True if the wrenches have a stiffness.
         exact: True if this is the exact tangent.
         accuracy: 1, relative error of the contact force.

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Bearing = Literal["fixed", "mobile"]
 
 MAX_UNLOADED_APPROACH = 0.5 * MILLIMETRE
-"""m: approach above which a contact without load is out of range; a sphere of 20 mm touches between
+"""m: approach above which a contact without load is out of range. A sphere of 20 mm touches between
 map points of 3 mm up to 0.06 mm.
 """
 

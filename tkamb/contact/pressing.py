@@ -262,7 +262,7 @@ def compression(pair: ContactPair, touch: Touch, result: ContactResult) -> tuple
     """Return the largest ratio of approach to insert thickness, and a description of its place.
 
     At first touch, where the undeformed bodies overlap by the whole approach, it detects a spike of
-    the femoral component, under each centre of pressure one of the insert.
+    the femoral component. Under each condyle's centre of pressure it detects a spike of the insert.
     """
     condyles = {"medial": result.medial, "lateral": result.lateral}
     positions = {"where the meshes first touch": touch.point} | {

@@ -13,7 +13,7 @@ The errors of about 0.5 mm and 0.5 deg exceed the deformation. Both are limits o
 
 Sharma (2008) does not give the centre of the turn; here it is the component's, which registration
 places best. A turn of 0.4 deg about the contact points, 25 mm below, would shift the component by
-0.2 mm; in dishes little wider than the condyles the contact would move by 1.3 mm, and the total
+0.2 mm. In dishes little wider than the condyles the contact would move by 1.3 mm, and the total
 force would change by 0.02 BW.
 """
 
@@ -46,7 +46,7 @@ class AdjustmentSettings:
     """Condition that restores the recorded rotation. "both": penetration and coronal angle after
     the press both exceed the adjustment (Sharma 2008). "either": one of them does."""
     input_change: float = 0.1 * MILLIMETRE
-    """m: error of a recorded gap, a fifth of fluoroscopy's; a frame is flagged if it decides
+    """m: error of a recorded gap, a fifth of fluoroscopy's. A frame is flagged if it decides
     whether the recorded rotation is changed.
     """
     largest_recorded_gap: float = 3.0 * MILLIMETRE

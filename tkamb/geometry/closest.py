@@ -301,9 +301,9 @@ class _CloseRegion:
 
         c = sum w_i p_i / sum w_i,   w_i = A_i exp(-(g_i - g) / d)
 
-    Sample i has the area A_i, the signed gap g_i and the nearest point p_i on the other body; g is
-    the smallest gap and d `CONDYLE.facet_depth`. If the gap has a sharp minimum, the centre is the
-    closest point.
+    Sample i has the area A_i, the signed gap g_i and the nearest point p_i on the other body. Here
+    g is the smallest gap and d is `CONDYLE.facet_depth`. If the gap has a sharp minimum, the centre
+    is the closest point.
     """
 
     def __init__(self, surface: Surface, faces: Index) -> None:

@@ -1,10 +1,11 @@
 """Decorators for loops that numba compiles at the first call and stores on disk.
 
-The import takes 0.1 to 0.4 s; the compiled code is stored beside the module, or in the user's cache
+The import takes 0.1 to 0.4 s. The compiled code is stored beside the module, or in the user's cache
 (`NUMBA_CACHE_DIR`) if that folder cannot be written. Indices are not checked against bounds.
 
-Numba's cache detects changes of its own file only: a compiled function may call those of other
-files, because its stored name contains a hash of these, but uses no other name of them.
+A compiled function may call compiled functions of other files, because its stored name contains a
+hash of these files. It uses no other name of them: Numba's cache detects changes of its own file
+only.
 """
 
 import hashlib

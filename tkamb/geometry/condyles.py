@@ -131,7 +131,7 @@ def condyle_split(femoral: Surface) -> float | None:
 def condyle_yaw(femoral: Surface, search: YawSearch = YAW_SEARCH) -> tuple[float, float]:
     """Return the angle between z and the line through both condyles, and the depth of the notch.
 
-    The notch is deepest along the line through both condyles; the angle is the mean over horizontal
+    The notch is deepest along the line through both condyles. The angle is the mean over horizontal
     directions with more than half this depth, weighted by depth.
 
     Returns:
@@ -279,8 +279,8 @@ class LowestPoints:
     """Lowest point of each condyle along the insert's y, prepared for many poses.
 
     The point has the y of the lowest vertex. For a smooth movement its x and z are means over the
-    condyle's surface with the weight exp(-height / `CONDYLE.facet_depth`), height above the lowest
-    vertex. `split` is z (m, femoral frame) between the condyles; None for one.
+    condyle's surface. The weight is exp(-height / `CONDYLE.facet_depth`), with the height above the
+    lowest vertex. `split` is z (m, femoral frame) between the condyles; None for one.
     """
 
     def __init__(self, femoral: Surface, split: float | None) -> None:

@@ -13,8 +13,8 @@ from tkamb.geometry.nearest import TriangleTree
 from tkamb.geometry.surface import Surface
 
 STEEP = 1e-9
-"""1: ratio of a triangle's area in the plan view to its area below which it is a wall and skipped;
-its edges are those of its neighbours.
+"""1: ratio of a triangle's area in the plan view to its area below which it is a wall and skipped.
+Its edges are those of its neighbours.
 """
 FACING = 0.2
 """1: smallest vertical component of a mean normal with which its plane is used as a bound."""

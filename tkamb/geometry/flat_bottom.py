@@ -66,7 +66,7 @@ def find_flats(surface: Surface) -> list[FlatBottom]:
     """Return the flats that may be the bottom, largest first.
 
     The search finds the direction that the most area faces, then the most frequent offset of
-    triangles within 15 deg of it, and fits a plane to them with decreasing tolerances. It is
+    triangles within 15 deg of it. It fits a plane to these with decreasing tolerances. It is
     repeated without this flat until none of comparable area remains.
     """
     normals, area = surface.face_normals, surface.areas
@@ -88,7 +88,7 @@ def find_flats(surface: Surface) -> list[FlatBottom]:
 def find_flat_bottom(surface: Surface, rotation: Array | None = None) -> FlatBottom:
     """Return the bottom of an insert: the largest flat that faces -y, within 30 deg.
 
-    Its area must be at least half of the largest flat's; a notice is printed if it is clearly
+    Its area must be at least half of the largest flat's. A notice is printed if it is clearly
     smaller.
 
     `surface` is in anatomical axes (x anterior, y superior, z right), m; `rotation` (3, 3) from

@@ -1,11 +1,11 @@
 """The intervals in which the lines of a structured grid run inside a closed surface.
 
-Every triangle is compared with the lines that cross its bounding rectangle: signs of three areas,
-which are exact integers (`tkamb.geometry.winding.PlanGrid`), decide whether one passes through it,
-so that none passes between two triangles. A line that meets an edge exactly is moved by an
-infinitesimal distance into each quadrant around it (simulation of simplicity, see
-`tkamb.geometry.winding`), and a place that is inside in any case counts, so that a line along a
-wall belongs to the body.
+Every triangle is compared with the lines that cross its bounding rectangle. The signs of three
+areas, which are exact integers (`tkamb.geometry.winding.PlanGrid`), decide whether a line passes
+through it, so that none passes between two triangles. A line that meets an edge exactly is moved by
+an infinitesimal distance into each quadrant around it (simulation of simplicity, see
+`tkamb.geometry.winding`). A place that is inside in any of these cases counts, so that a line along
+a wall belongs to the body.
 
 A place is inside if more entries than exits lie below it: a wall between two touching bodies does
 not end an interval, and a void stays empty. A line through a hole of the mesh has unequal numbers

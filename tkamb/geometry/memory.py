@@ -42,7 +42,7 @@ def available_memory() -> float:
 
 
 def _machine() -> float:
-    """Caches that can be dropped are included, bytes."""
+    """Return bytes, including caches that can be dropped."""
     try:
         for line in STATISTICS.read_text().splitlines():
             if line.startswith("MemAvailable:"):
@@ -85,8 +85,8 @@ def _address_space() -> float:
 def give_back() -> None:
     """Collect reference cycles, and return freed memory to the system (with glibc).
 
-    A knee with its meshes has reference cycles, which Python collects by number, not by size:
-    eighteen knees in turn used 0.73 GB, but 0.38 GB with a collection after each. glibc keeps freed
+    A knee with its meshes has reference cycles, which Python collects by number, not by size.
+    Eighteen knees in turn used 0.73 GB, but 0.38 GB with a collection after each. glibc keeps freed
     memory between used blocks.
     """
     gc.collect()

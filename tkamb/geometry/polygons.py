@@ -118,7 +118,7 @@ class CrossedPolygonError(ValueError):
 def triangulated(vertices: Array, corners: Index, ends: Index) -> Index:
     """Return polygons as triangles (k, 3) with the winding of the polygons.
 
-    A convex polygon becomes a fan about its first corner; from a concave one ears are cut off one
+    A convex polygon becomes a fan about its first corner. From a concave one ears are cut off one
     by one (Meisters, Am Math Monthly 82:648, 1975). Those with fewer than three corners are
     skipped.
 

@@ -1,8 +1,8 @@
 """The post of an insert: its search, and its separation from the dishes.
 
-In a posterior-stabilised insert a cam of the femoral component pushes it from behind, which contact
-models that press along y do not include: `divide_insert` divides the insert into the dishes for the
-condyles and the post for the cam.
+In a posterior-stabilised insert a cam of the femoral component pushes the post from behind. Contact
+models that press along y do not include this. `divide_insert` divides the insert into the dishes
+for the condyles and the post for the cam.
 """
 
 from dataclasses import dataclass

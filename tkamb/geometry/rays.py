@@ -81,7 +81,7 @@ class RayCaster:
         """Return the distance (n,), m, of the first exit that counts on each ray; inf without exit.
 
         An exit through an inner wall, where the next shell begins, or into a closed void, which has
-        its own shell, does not count; one into an undercut does, although the ray enters again
+        its own shell, does not count. An exit into an undercut does, although the ray enters again
         behind it.
 
         Arguments as in `first`.

@@ -4,7 +4,7 @@ Files of CAD systems contain the two-sided wall between touching bodies: a trian
 the other body's material in front of it. A whole wall of such triangles is removed, and the outer
 surfaces of the bodies are joined along its rim: an open edge is divided at the vertices of the
 other surface that lie on it. If bodies overlap, or a triangle extends beyond the wall, the wall
-stays; results do not depend on it (`tkamb.geometry.winding`).
+stays. Results do not depend on it (`tkamb.geometry.winding`).
 """
 
 from collections import defaultdict

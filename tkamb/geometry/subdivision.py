@@ -85,7 +85,7 @@ class _Search:
     """Search for the middle triangles of coarser triangles that were divided into four.
 
     A middle's corners halve the edges between its neighbours' tips, the corners of the coarser
-    triangle; the search spreads from one middle across these tips.
+    triangle. The search spreads from one middle across these tips.
     """
 
     def __init__(self, vertices: Array, faces: Index, across: Index) -> None:

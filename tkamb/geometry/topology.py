@@ -180,8 +180,9 @@ class Body:
 def separate_bodies(vertices: Array, faces: Index) -> list[Body]:
     """Return the bodies of a surface, sorted by the area of the outer surface, largest first.
 
-    A void's normals point into it: a closed part of negative volume is a void of another one if its
-    bounding box lies within that one's. The faces are repaired (`tkamb.geometry.repair.repair`).
+    A void's normals point into it, so its volume is negative. A closed part is a void of another
+    one if its volume is negative and its bounding box lies within the other's. The faces are
+    repaired (`tkamb.geometry.repair.repair`).
     """
     label = connected_parts(faces)
     parts = [np.flatnonzero(label == part) for part in range(int(label.max(initial=-1)) + 1)]

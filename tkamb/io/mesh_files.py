@@ -146,7 +146,9 @@ BODY_FORMATS = (".stl", ".ply", ".obj")
 
 @dataclass(frozen=True, eq=False)
 class LatticeReport:
-    """Args:
+    """A lattice, its quality and its file.
+
+    Args:
     out: path of the .vtu file; None: no file is written.
     side: side of the knee; the lattice of a left insert is mirrored.
     """

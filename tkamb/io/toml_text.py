@@ -1,7 +1,7 @@
 """Reading of users' TOML within limits, and writing of values as TOML text.
 
-A small text must not take hours or gigabytes: the time of Python's reader grows with the square of
-a dotted key's parts, its memory with nesting, and it fails at integers of thousands of digits.
+A small text must not take hours or gigabytes. The time of Python's reader grows with the square of
+a dotted key's parts, and its memory with nesting. It fails at integers of thousands of digits.
 tkamb checks all three first.
 """
 

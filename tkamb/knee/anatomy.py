@@ -1,8 +1,8 @@
 """Finds the knee in a Pinocchio model: its frames, its joints, and the bodies of the shank.
 
 The shank is every body on the tibia's side of the knee, including the foot; the thigh the body to
-which the frame "femur" is fixed. The pelvis acts on it by the load at the hip, so that the same
-equations hold for a leg that stands on its foot, one that hangs from a pelvis, and a whole body.
+which the frame "femur" is fixed. The pelvis acts on it by the load at the hip. The same equations
+therefore hold for a leg that stands on its foot, one that hangs from a pelvis, and a whole body.
 """
 
 from collections.abc import Mapping, Sequence

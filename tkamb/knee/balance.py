@@ -52,7 +52,7 @@ class BalanceSettings:
     """
     largest_jump: float = 1.0
     """N: largest jump on which an equilibrium may lie. 0.1 % of a usual load. Measured: at 2 mm 3
-    of 72 frames of subject JW had no equilibrium without it; the foundation's force jumped by 0.2
+    of 72 frames of subject JW had no equilibrium without it. The foundation's force jumped by 0.2
     to 0.6 N, where a column crosses an edge of two femoral facets.
     """
     max_travel: float = 20e-3

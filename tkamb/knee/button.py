@@ -10,10 +10,10 @@ frame (x anterior, y superior, z to the right) these axes are
 turned further by the few degrees that make the back level. The origin is the middle of the back's
 bounding rectangle.
 
-The button is pressed along its axis y_b at the patella's pose, until the contact carries the axial
-part, -F (n . y_b), of the patellofemoral force F of the equations along the contact normal n, from
-femur to patella. The contact is frictionless: its force across the axis follows from the surfaces,
-and the sagittal difference to F n is a result (`ButtonPress.imbalance`), as a residual is.
+The equations give the patellofemoral force F along the contact normal n, from femur to patella. The
+button is pressed along its axis y_b at the patella's pose, until the contact carries the axial
+part, -F (n . y_b). The contact is frictionless, and its force across the axis follows from the
+surfaces. The sagittal difference to F n is a result (`ButtonPress.imbalance`), as a residual is.
 
 Medial and lateral facet are the parts of the contact on the two sides of the patella's sagittal
 plane, in the femoral frame.
@@ -245,7 +245,7 @@ def without_pegs(body: Surface) -> Surface:
     """Return a button in the button frame without the parts below its flat back.
 
     Pegs are cemented into the bone and do not deform. The end of a peg moves up to y = 0 and closes
-    the back; its wall, which has no area there, is removed.
+    the back. Its wall, which has no area there, is removed.
     """
     if body.bounds[0, 1] > -PEG:
         return body

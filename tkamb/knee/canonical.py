@@ -285,7 +285,7 @@ class Bridge:
         """Return coordinates, rates and accelerations (3, n) between two bodies.
 
         q is that of the chain with its root at the neutral pose; `base` is on the parent body,
-        `follower` on the child; `rows` are theirs in the chain's joint coordinates.
+        `follower` on the child. `rows` are these coordinates in the chain's joint coordinates.
         """
         twist, rate = self._relative(data, base, follower)
         model, cache = self.chain.model, self._chain_data

@@ -22,7 +22,7 @@ has two uses:
        N_side = N_side(weight, inertia and ground) + N_side(ligaments) + sum_i N_side(muscle i),
 
 plus N_side(post) if a cam on the insert's post is modelled. Each term has all other muscles and
-ligaments at zero force; a moment about the insert's z balances its flexion moment, and these
+ligaments at zero force. A moment about the insert's z balances its flexion moment, and these
 moments add up to the knee's reserve.
 
 References: Winby et al., J Biomech 42:2294 (2009), doi:10.1016/j.jbiomech.2009.06.019;
@@ -63,8 +63,8 @@ class CrossingLines:
     def turned(self, state: "ChainState") -> float:
         """Return the rotation of the knee since the points were computed, rad; NaN: unknown.
 
-        The error of a line's direction is at most about this: the end of a line that wraps a bone
-        or passes a via point moves with the knee, but here it is fixed.
+        The error of a line's direction is at most about this angle. The end of a line that wraps a
+        bone or passes a via point moves with the knee, but here it is fixed.
         """
         if self.knee is None:
             return float("nan")

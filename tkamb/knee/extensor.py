@@ -258,8 +258,8 @@ class ExtensorFrames:
         """Return the patella for slightly changed lines or poses of the femur.
 
         In the given frames the equilibrium is solved again, from the last one. A solved patella
-        moves there; a recorded one moves from `recorded` (f, 3), possibly changed coordinates, by
-        the change of the equilibrium, and is lost if one of the two equilibria does not exist. The
+        moves there. A recorded one moves from `recorded` (f, 3), possibly changed coordinates, by
+        the change of the equilibrium. It is lost if one of the two equilibria does not exist. The
         rates and all other frames do not change.
         """
         other = copy.copy(self)

@@ -170,7 +170,9 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class FrameMethod:
-    """The contact is prepared at its first use.
+    """How the frames of a knee are computed.
+
+    The contact is prepared at its first use.
 
     Args:
         knee: a knee of a right leg.

@@ -10,9 +10,9 @@ whose tangent planes pass through P. The unknowns are the angle φ along the con
 of the geodesic; the tangent at its end must pass through Q. Newton's method solves these two
 equations, with derivatives from j.
 
-An affine map to the unit sphere keeps straight lines and tangency, and contours and plane sections
-are circles there: a taut string in a plane has a closed form. The initial guess is the one in any
-plane through P and Q that is shortest on the ellipsoid.
+An affine map to the unit sphere keeps straight lines and tangency. There contours and plane
+sections are circles, and a taut string in a plane has a closed form. The initial guess is the one
+in any plane through P and Q that is shortest on the ellipsoid.
 
 Reference: Scholz et al., Multibody Syst Dyn 36:195 (2016), doi:10.1007/s11044-015-9451-1, for
 Newton's method with Jacobi fields.

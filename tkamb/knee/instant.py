@@ -1,7 +1,7 @@
 """A knee at one instant: geometry, contact points and loads, at q or at other knee coordinates.
 
-The motion of the shank depends on q, v and a alone, so the wrench that the knee must exert on it is
-computed once in a search over knee coordinates.
+The motion of the shank depends on q, v and a alone. The wrench that the knee must exert on it is
+therefore computed once in a search over knee coordinates.
 """
 
 from collections.abc import Callable, Mapping

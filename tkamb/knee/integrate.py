@@ -5,15 +5,15 @@ Let v_m = (1 - theta) v + theta v'. Newton's method solves the equations of a st
     v' = v + h a(q + theta h v_m, v_m),    q' = q + h v_m,
 
 for v'. Here a is the result of `pin.aba` with `Knee.external_forces`. theta = 1/2 is the implicit
-midpoint rule, of second order, which conserves the energy of a frictionless contact; theta = 1 is
+midpoint rule, of second order, which conserves the energy of a frictionless contact. theta = 1 is
 the implicit Euler method, of first order, which dissipates energy, so that the knee converges to
 equilibrium. An explicit step would have to resolve the oscillation of the contact, which has 100 Hz
 or more under the mass of a thigh.
 
-The forces of a contact have kinks, and Newton's step d may overshoot across one. With the residual
-r of the first equation and the inertia M of the joints, M r is without friction the gradient of an
-energy that is lowest at the end of the step. d is halved while d . M r is positive at its end and
-more than a given share of its size at the beginning: the energy then rises again.
+The forces of a contact have kinks, and Newton's step d may overshoot across one. Let r be the
+residual of the first equation and M the inertia of the joints. Without friction, M r is the
+gradient of an energy that is lowest at the end of the step. d is halved while d . M r is positive
+at its end and more than a given share of its size at the beginning: the energy then rises again.
 
 References: Hairer, Lubich & Wanner, Geometric Numerical Integration, 2nd ed., II.1.1 (2006),
 doi:10.1007/3-540-30666-8; Matthies & Strang, Int J Numer Methods Eng 14:1613 (1979),
@@ -143,9 +143,9 @@ def implicit_step(
 def _rotation_stiffness(knee: Knee, forces: Any, data: KneeData) -> Array:
     """Return the stiffness (6, 6) due to the rotation of the femur, insert frame.
 
-    The derivatives of `pin.aba` hold a force constant in the joint's frame, but the knee's force w
-    on the femur is constant in the insert frame, so that a displacement xi of the femur changes it
-    by -xi x* w in the femur's.
+    The derivatives of `pin.aba` hold a force constant in the joint's frame. The knee's force w on
+    the femur is constant in the insert frame instead, so that a displacement xi of the femur
+    changes it by -xi x* w in the femur's frame.
     """
     bridge, placements = knee.bridge, data.data.oMi
     insert = placements[bridge.insert.joint] * bridge.insert.placement

@@ -5,7 +5,7 @@ tension, constant along the path without friction. The wrench on a link is -T dL
 displacement x: the tension pulls along the straight parts at their ends and presses on a surface
 where the path meets and leaves it. The sum of all wrenches is zero.
 
-If an end of the path moves into an ellipsoid, this shrinks, so that L is continuous; inside a
+If an end of the path moves into an ellipsoid, this shrinks, so that L is continuous. Inside a
 cylinder, a sphere or a section there is no path.
 """
 

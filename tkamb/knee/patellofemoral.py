@@ -5,13 +5,13 @@ femur. The patella moves in its sagittal plane (x, y, rotation about z).
 
 Sample i of the button's articular side has the signed distance d_i from the femoral component, the
 nearest point p_i and the normal n_i there. The closest point of two faceted, nearly conforming
-surfaces jumps by centimetres from frame to frame, so the contact of the left (-z) and of the right
-side of the patella is a weighted mean over its samples, with weights w_i ~ exp(-d_i/tau):
+surfaces jumps by centimetres from frame to frame. The contact of the left (-z) and of the right
+side of the patella is therefore a weighted mean over its samples, with weights w_i ~ exp(-d_i/tau):
 
     g = sum w_i d_i - tau,    p = sum w_i p_i,    n = sum w_i n_i
 
 For a paraboloid of any curvature, g is exactly the distance of the closest points. In its groove a
-patella touches on both sides, and soft tissue decides the share lambda of the left one: per unit
+patella touches on both sides. Soft tissue decides the share lambda of the left one: per unit
 contact force, the patella shifts by c times the lateral force and tilts by d times the tilting
 moment:
 

@@ -1,6 +1,6 @@
 """Muscle forces and compliance over the passes of a search for released coordinates.
 
-The muscle forces depend on the knee's equilibrium, and this on the muscle forces; under a light
+The muscle forces depend on the knee's equilibrium, and this on the muscle forces. Under a light
 load the knee is compliant, and a plain iteration would oscillate. Each pass therefore changes the
 applied forces f by a share omega of the difference from the required forces f',
 
@@ -8,9 +8,9 @@ applied forces f by a share omega of the difference from the required forces f',
 
 where d and d' are the last two differences f' - f (Aitken's secant for a vector).
 
-The moment arms of the muscles depend on the compliance, and this on the equilibrium: the first
-passes use the measured compliance, later ones change it by half of its difference from the measured
-one, then by a quarter, so that it converges even if the contact's stiffness changes fast with the
+The moment arms of the muscles depend on the compliance, and this on the equilibrium. The first
+passes use the measured compliance. Later ones change it by half of its difference from the measured
+one, then by a quarter. It thus converges even if the contact's stiffness changes fast with the
 pose. After these it stays constant, and `compliance_error` is the remaining relative difference.
 
 References: Irons & Tuck, Int J Numer Methods Eng 1:275 (1969), doi:10.1002/nme.1620010306;

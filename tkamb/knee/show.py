@@ -125,7 +125,7 @@ _SEEN: "weakref.WeakSet[Any]" = weakref.WeakSet()
 def _look_at(window: Any, insert: Array, is_left: bool) -> None:
     """Move all that Python draws so that the knee is upright before the camera.
 
-    No message moves MeshCat's camera, which looks at its world's origin with z up; its grid and
+    No message moves MeshCat's camera, which looks at its world's origin with z up. Its grid and
     axes, which do not move, are hidden.
     """
     turn = np.column_stack([np.eye(3)[0], np.eye(3)[2], -np.eye(3)[1]])  # insert x, y, z

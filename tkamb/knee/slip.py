@@ -182,7 +182,7 @@ def roll_slip_motion(
 ) -> Array:
     """Return the motion of Sharma (2008): AP follows from rolling and slip, SI from first touch.
 
-    The mean contact point moves backwards along the insert by the femoral arc less the slip; the
+    The mean contact point moves backwards along the insert by the femoral arc less the slip. The
     femur is lowered to first touch in every frame.
 
     Args:

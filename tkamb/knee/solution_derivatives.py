@@ -145,7 +145,7 @@ class ImplicitEquilibrium:
 
     With a released patella the tension Q of the quadriceps is one more unknown, and the moment that
     would have to hold flexion one more equation. The patella's wrench on the tibia is linear in the
-    displacement and in Q; its six coordinates have been eliminated (`PulledTibiaSlopes`).
+    displacement and in Q. Its six coordinates have been eliminated (`PulledTibiaSlopes`).
 
     Args:
         search: the search that found the equilibrium.

@@ -96,8 +96,8 @@ def _wrapped(angles: Array) -> Array:
 def _around(
     distances: tuple[Array, Array], sweep: Array, radius: float
 ) -> tuple[Array, Array, tuple[Array, Array]]:
-    """`distances` (f,), m, of a string's ends are from the centre of a circle; `sweep` (f,), rad,
-    is the signed angle about it from start to end, on the string's side.
+    """Return a taut string around a circle. `distances` (f,), m, of its ends are from the centre.
+    `sweep` (f,), rad, is the signed angle about it from start to end, on the string's side.
 
     Returns:
         Signed angle of the arc (f,), rad, zero if the string does not touch; angle (f,) from the
@@ -137,7 +137,7 @@ def _cylinder(
 
 
 def _sphere(start: Array, end: Array, radius: float, quadrant: tuple[int, int] | None) -> WrapTouch:
-    """The strings lie in the plane of their ends and the centre.
+    """Return strings in the plane of their ends and the centre.
 
     If the short way passes on the half that is not prescribed, a string takes the long way, unless
     both of its ends lie on the prescribed half.
@@ -276,7 +276,9 @@ TOLERANCE = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class WrappedStrings:
-    """Args:
+    """f strings over w objects.
+
+    Args:
     order: indices of the objects that each of f strings touches, from start to end, then -1,
         (f, w).
     entry: points where the strings meet the objects, m, (f, w, 3); they leave at `exit`,

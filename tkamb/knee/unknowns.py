@@ -10,8 +10,8 @@ the leg.
 Lines pull and contacts push: the two normal forces, the tensions of muscle and patellar ligament
 and the patellofemoral normal force are >= 0. A load that would have the wrong sign is zero, and a
 residual moment replaces it as unknown. There are at most six load states: both condyles loaded, the
-medial or the lateral one lifted (unless the recorded gap excludes it), each with the extensor
-mechanism taut or slack.
+medial or the lateral one lifted, each with the extensor mechanism taut or slack. The recorded gap
+may exclude some.
 
 Reference: Komistek et al., J Biomech 38:215 (2005), doi:10.1016/j.jbiomech.2004.02.041.
 """

@@ -9,7 +9,7 @@ length. If S is that of the taut path in the x-y plane,
 When the tangent corner changes or wrapping begins, the two candidate paths coincide, so that length
 and moment arm are continuous.
 
-The tension is constant along the string; its force on the bone at a corner is the tension times the
+The tension is constant along the string. Its force on the bone at a corner is the tension times the
 change of direction, without z component.
 """
 

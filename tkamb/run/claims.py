@@ -1,7 +1,8 @@
 """What a run may be said to show.
 
-A claim is decided here once, from the run's numbers and the measured knees of docs/truth.md, for
-report, terminal, viewer, `compare` and summary: no output contradicts another one or a measurement.
+A claim is decided here once, for report, terminal, viewer, `compare` and summary. It uses the run's
+numbers and the measured knees of docs/truth.md, so that no output contradicts another one or a
+measurement.
 """
 
 import json

@@ -1,17 +1,17 @@
 """The contact of one frame as an input file (deck) of CalculiX or FEBio 4, in mm, N and MPa.
 
-Both decks contain the hexahedra of the insert, with contact nodes on the smooth surface that
-approximates its mesh, as in the lattice, and a rigid, faceted patch of the femoral component that
-moves along y only.
+Both decks contain the hexahedra of the insert, and a rigid, faceted patch of the femoral component
+that moves along y only. Contact nodes lie on the smooth surface that approximates the insert's
+mesh, as in the lattice.
 
 CalculiX: contact is node to surface by penalty, and a node's force its pressure times its tributary
-area of the deformed faces. The patch is a layer of wedges, which starts in the insert at the
-approach of the foundation model (not the run's solution), under the whole load; CalculiX finds the
+area of the deformed faces. The patch is a layer of wedges under the whole load. It starts in the
+insert at the approach of the foundation model (not the run's solution), and CalculiX finds the
 equilibrium.
 
 FEBio: the insert is an isotropic elastic (St. Venant-Kirchhoff) solid in finite deformation.
 Contact is sliding-elastic and frictionless, by augmented Lagrangian. The patch is displaced from
-first touch by the approach of the run, and FEBio returns the force: a load cannot be prescribed,
+first touch by the approach of the run, and FEBio returns the force. A load cannot be prescribed,
 since the stiffness is zero at first touch.
 
 Reference: FEBio User Manual 4.0, chapter 3, the input file format.

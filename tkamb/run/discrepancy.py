@@ -13,7 +13,7 @@ over the frames t of a trial of an activity.
 
 m is common to all trials of an activity, b to all frames of a trial. w is correlated over about 0.1
 s. S² is the mean square of the trials' biases, V the mean square of their scatters, over the trials
-of the activity or, if it has none, over all trials. All trials are of one subject; to include the
+of the activity or, if it has none, over all trials. All trials are of one subject. To include the
 differences between subjects, a published blind prediction of others counts as one more trial. Its
 root mean square error in body weights is divided by G of walking. The square, bias² + scatter², is
 split into S² and V in the ratio of the trials.

@@ -2,10 +2,10 @@
 
 An error is relative to a converged reference: the largest over the measured cases, widened for the
 number of pairs of bodies, but no bound for other cases. The cases are those of the trade-off study
-and half of the pairs of `scripts/measure/error_cases.py`; the other half is held out and tests the
-share of new errors below the stored ones (docs/known_errors.md). `scripts/make/tradeoff_table`
-writes `run/known_errors.json`. An error is stated only within the range of its pairs; outside, and
-for other settings, it is "not measured".
+and half of the pairs of `scripts/measure/error_cases.py`. The other half tests the share of new
+errors below the stored ones (docs/known_errors.md). `scripts/make/tradeoff_table` writes
+`run/known_errors.json`. An error is stated only within the range of its pairs; outside, and for
+other settings, it is "not measured".
 """
 
 import json

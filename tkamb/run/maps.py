@@ -1,14 +1,14 @@
 """The pressure maps of a run, in contact.h5 or in memory.
 
-The file is written a few frames at a time, first their maps, then their times: the length of
-`/time_s` is the number of complete frames, even if the run was killed. Each frame is a compressed
-chunk of its own, so that a write does not alter earlier frames. Readers take a few frames at a time
-(`ContactMaps.rows`, `ContactMaps.blocks`), so that memory does not depend on the length of the
-recording.
+The file is written a few frames at a time, first their maps, then their times. The length of
+`/time_s` is therefore the number of complete frames, even if the run was killed. Each frame is a
+compressed chunk of its own, so that a write does not alter earlier frames. Readers take a few
+frames at a time (`ContactMaps.rows`, `ContactMaps.blocks`), so that memory does not depend on the
+length of the recording.
 
 The HDF5 library cannot close a file after a failed write: it tries again, fails, and ends the
 process. tkamb's writes go through a Python file object, which records the first failure and ignores
-later writes, so that the library can close the file and `new_hdf5` raises.
+later writes. The library can then close the file, and `new_hdf5` raises.
 """
 
 import io

@@ -106,8 +106,8 @@ def split_undetermined(results: "Results") -> NDArray[np.bool_]:
 def moved_per_half_degree(results: "Results") -> Array:
     """Return the force (f,), N, that 0.5 deg of adduction shifts between the condyles.
 
-    It is linear in the angle, at most the more loaded condyle's force, and NaN with one loaded
-    condyle, because the slope changes when the other touches.
+    It is linear in the angle, and at most the force of the more loaded condyle. It is NaN if only
+    one condyle is loaded, because the slope changes when the other touches.
     """
     share = medial_share(results, "deformation")
     shift = 0.5 * np.abs(results["medial_force_per_adduction_N_per_deg"])

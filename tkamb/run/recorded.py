@@ -158,8 +158,8 @@ def fitted_normalisation(
 ) -> dict[str, float | None]:
     """Return EMG channel -> normalising value for which its envelope fits the activations best.
 
-    It is v / s with the current value v, and the scale s = Σ a e / Σ e² that minimises Σ (a - s e)²
-    over frames and muscles of the channel. None: s is not positive.
+    It is v / s with the current value v. The scale s = Σ a e / Σ e² minimises Σ (a - s e)² over
+    frames and muscles of the channel. None: s is not positive.
 
     Args:
         columns: columns of results.csv of a run without guidance by EMG.

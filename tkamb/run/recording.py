@@ -1,7 +1,7 @@
 """A knee in the frames of a recorded motion: each frame as an instant, and what runs store of it.
 
 A resumed run takes its initial guess from the stored arrays of contact (`frame_arrays`,
-`Recording.recalled`), which lack the displacements of the lattice: it differs from a single run
+`Recording.recalled`). They lack the displacements of the lattice, so it differs from a single run
 within the tolerance of the solver.
 """
 

@@ -2,8 +2,7 @@
 
 The medial-lateral split has two estimates: by deformation (the contact model at the recorded
 rotation), and by coronal equilibrium. A frame is flagged if they differ by much, if equilibrium
-needs a large residual, or if a condyle is loaded by the equations only: an input is then wrong or
-unknown.
+needs a large residual, or if only the equations load a condyle. An input is then wrong or unknown.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,8 @@
 """Distribution of jobs over worker processes or a Dask cluster.
 
-A worker is a Python process that runs this module: it prepares the task once, reads pickled jobs
-from standard input, and writes pickled answers to standard output until the input ends, even if the
-parent was killed. Unlike multiprocessing, it does not import the calling script.
+A worker is a Python process that runs this module. It prepares the task once, then reads pickled
+jobs from standard input and writes pickled answers to standard output. It ends when the input ends,
+even if the parent was killed. Unlike multiprocessing, it does not import the calling script.
 
 Dask is an extra (`pip install 'tkamb[cluster]'`). If a cluster's worker dies, another one repeats
 its job, which is a function of its number and content only.

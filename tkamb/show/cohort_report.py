@@ -226,8 +226,9 @@ def _plots(groups: Sequence[Group]) -> Any:
 def _split_into_plots(groups: Sequence[Group]) -> list[tuple[str, dict[str, Group]]]:
     """Return for each plot the label value that its groups share, and its groups by name.
 
-    Of too many groups, each plot shows those of one value of the label with the fewest values that
-    leaves at most `AT_ONCE` in a plot, or else so many in their order.
+    If there are too many groups, each plot shows those of one value of a label. It is the label
+    with the fewest values that leaves at most `AT_ONCE` groups in a plot. Without such a label the
+    groups are divided in their order.
     """
     if len(groups) > AT_ONCE:
         values = {
@@ -302,8 +303,9 @@ def _typical(
     """Return one run of each group, and whether these runs differ only in the groups' labels.
 
     Maps of the same subject and trial are easiest to compare, so all runs share the labels that do
-    not define the groups if possible, in the set of peak forces nearest to the groups' medians;
-    else each has the run of its median. Runs without a map are ignored.
+    not define the groups, if possible. Of several such sets, that of peak forces nearest to the
+    groups' medians is returned. Otherwise each group has the run of its median. Runs without a map
+    are ignored.
     """
     peaks = [
         {

@@ -62,8 +62,8 @@ def pair_frames(
     """Pair the frames of two runs.
 
     If every frame of the shorter run has a match at the same time and position, both have the same
-    recording and these frames are paired; otherwise the other run is interpolated linearly within
-    its range, which needs monotonic axes (None without).
+    recording, and these frames are paired. Otherwise the other run is interpolated linearly within
+    its range. Without monotonic axes the result is None.
     """
     same = _same_frames(first["time_s"], first_axis.values, other["time_s"], other_axis.values)
     if same is not None:
@@ -116,7 +116,9 @@ MAX_RUNS = 8
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """Args:
+    """One folder of results.
+
+    Args:
     pairing: pairing of a folder with the first run; None: frames cannot be paired.
     """
 
@@ -151,7 +153,9 @@ class Difference:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Args:
+    """Comparison of runs with the first of them.
+
+    Args:
     kind: horizontal axis: "flexion", "cycle" or "time".
     notes: sentences on different settings and on columns that cannot be compared.
     differences: one per column of each run after the first.
@@ -307,7 +311,7 @@ def _flat(value: Any, name: str = "") -> dict[str, Any]:
 
 
 def _unlike_inputs(runs: Sequence[Run]) -> list[str]:
-    """Return a sentence for each input file of other content; one that only some runs read is in a
+    """Return a sentence for each input file of other content. One that only some runs read is in a
     setting.
     """
     inputs = [run.results.summary.get("inputs") or {} for run in runs]

@@ -39,7 +39,9 @@ FAILED_ROW_HEIGHT = 0.03
 
 @dataclass(frozen=True, eq=False)
 class Quantity:
-    """Args:
+    """Quantity of one picture.
+
+    Args:
     values: function of a run's results that returns (f,) values, in `unit`.
     """
 

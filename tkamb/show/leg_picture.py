@@ -1,6 +1,6 @@
 """Pictures of the leg: three frames with the ground reaction, and registered markers.
 
-The rows show the whole leg from the lateral side and from the front, then the knee likewise; the
+The rows show the whole leg from the lateral side and from the front, then the knee likewise. The
 last one names the ligaments. The laboratory's y is up, and forward the mean direction of the
 insert's x over the three frames. A left knee is mirrored at input and mirrored back in the picture.
 """
@@ -88,7 +88,7 @@ class LegFrame:
 def shown_frames(case: Case) -> list[int]:
     """Return three distinct frames in time order, or fewer for a short motion.
 
-    They are the first frame and those of the largest ground reaction and flexion; one near another
+    They are the first frame and those of the largest ground reaction and flexion. One near another
     is replaced by the last or the middle frame.
     """
     count = len(case.motion.time)

@@ -64,7 +64,7 @@ STANCE = "#eef3f7"
 class Sheet:
     """A figure on which the plots of a run are drawn one after the other.
 
-    Axes and ticks take most of a plot's time and are reused; a plot that `_place_alone` cannot
+    Axes and ticks take most of a plot's time and are reused. A plot that `_place_alone` cannot
     place has a separate figure.
     """
 

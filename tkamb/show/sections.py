@@ -87,7 +87,9 @@ NUMBER = re.compile(r"-?\d+(?:\.\d+)?")
 
 @dataclass(frozen=True)
 class TextTable:
-    """Args:
+    """A table of texts.
+
+    Args:
     rows: cells below each heading, a name or (name, unit). In a table of strains, the bundle
         comes first.
     """
@@ -297,8 +299,8 @@ def _wear_content(wear: dict[str, Any], picture: str) -> dict[str, Any]:
 def wear_of_run(results: "Results") -> dict[str, Any] | None:
     """Return the content of wear.json in a run's folder; None: the folder has no such file.
 
-    It is empty if wear.json belongs to the button, another scene, other files or other frames;
-    these are not compared if the wear is of the whole motion or a simulator's cycle.
+    It is empty if wear.json belongs to the button, another scene, other files or other frames. The
+    frames are not compared if the wear is of the whole motion or a simulator's cycle.
     """
     folder = results.directory
     if folder is None or not (folder / WEAR_NAME).is_file():

@@ -1,6 +1,6 @@
 """Stored rows of a study, which can therefore be stopped and resumed.
 
-Each row is stored at once as a line of JSON, {"key": ..., "row": ..., "sha256": ...}: "key" is the
+Each row is stored at once as a line of JSON, {"key": ..., "row": ..., "sha256": ...}. "key" is the
 SHA-256 of the measured case and the code, "sha256" that of key and row. An incomplete or changed
 line counts as absent.
 """

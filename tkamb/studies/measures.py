@@ -1,7 +1,8 @@
 """Times, memory and results of one contact model on one case.
 
-Each job runs in a process of its own with one thread for repeatable times, which reads a `Job` and
-prints the `Measure` as JSON: the peak memory is that of the job, and a crash or a hang is recorded.
+Each job runs in a process of its own, which reads a `Job` and prints the `Measure` as JSON. The
+peak memory is that of the job, and a crash or a hang is recorded. One thread gives repeatable
+times.
 
 `quantities`, `errors` and `map_error` compare two contact results.
 """
@@ -145,7 +146,9 @@ def environment(variables: Mapping[str, str]) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Job:
-    """Args:
+    """A contact model and a case to measure.
+
+    Args:
     scene: path of a user's scene, for the cases of that scene.
     """
 

@@ -1,6 +1,6 @@
 """Stability study: extreme cases of contacts and of whole runs, each judged in its own process.
 
-The shipped knee bend is run on a few frames with one extreme parameter; the expected result needs
+The shipped knee bend is run on a few frames with one extreme parameter. The expected result needs
 no second solver:
 
 - all: the nodal forces on the insert sum to the superior-inferior force of the equilibrium.

@@ -1,6 +1,6 @@
 """Trade-off of speed and accuracy: contact models on every case, and multibody settings.
 
-A `Row` has the times and errors of one model on one case; the rows that no other row beats are the
+A `Row` has the times and errors of one model on one case. The rows that no other row beats are the
 case's Pareto front. Fine grids and solver options are measured on some cases only, unless `full`.
 
 A multibody run changes one setting of the shipped knee bend and is compared with the run as shipped
@@ -58,7 +58,9 @@ EQUAL_RATIO = 1.2
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """Args:
+    """Cost and errors of one model on one case.
+
+    Args:
     errors: name of `KEYS` -> error relative to the reference; empty if the job failed.
     floor: largest relative uncertainty of the reference among `FRONT_ERRORS`.
     on_front: whether the row is on the Pareto front of its case.

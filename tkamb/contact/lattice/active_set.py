@@ -7,7 +7,7 @@ Find the normal forces lambda (and the approach D) such that, for every candidat
 Either D or the load -cᵀ lambda is given. A is the compliance along the femoral normals, symmetric
 and positive definite, c the y of these normals. Primal-dual active set (Hintermueller, Ito &
 Kunisch, SIAM J Optim 13:865, 2002, doi:10.1137/S1052623401383558). Once a set recurs, only the node
-with the largest violation changes; the search stops after twice as many sets as candidates.
+with the largest violation changes. The search stops after twice as many sets as candidates.
 """
 
 from dataclasses import dataclass

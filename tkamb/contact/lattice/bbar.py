@@ -30,7 +30,7 @@ _ROOT = (_VECTORS * np.sqrt(np.maximum(_VALUES, 0))).T[_VALUES > 1e-12]
 class BbarHexahedra(Solid):
     """Mean-dilatation hexahedra, small strain, J2 deformation theory at the Gauss points.
 
-    At each point e² = (2/3) dev eps : dev eps and 3 mu_s = q(e)/e (see `ShearCurve`); the bulk is
+    At each point e² = (2/3) dev eps : dev eps and 3 mu_s = q(e)/e (see `ShearCurve`). The bulk is
     elastic, and `Solid` has the arguments.
     """
 

@@ -12,9 +12,9 @@ all equations). The deviatoric stiffness of a cell of any shape is
 
     K_d = V B̄ᵀ (2 I_dev) B̄ + Pᵀ K_spr P
 
-Here B̄ gives the strain of the cell's mean displacement gradient and I_dev its deviatoric part, P
-subtracts the linear field of this gradient, and K_spr is the matrix of the springs. So the patch
-test is exact for sheared cells too.
+Here B̄ gives the strain of the cell's mean displacement gradient, and I_dev its deviatoric part. P
+subtracts the linear field of this gradient. K_spr is the matrix of the springs. So the patch test
+is exact for sheared cells too.
 """
 
 from collections.abc import Iterator

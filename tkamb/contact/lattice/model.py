@@ -288,9 +288,9 @@ class CellContact(ContactModel):
     ) -> Solution:
         """Solve with the stored factor, and by Newton's method if this does not converge.
 
-        It is not tried if the gap residual is at least the force residual (the nodes oscillate on
-        the femoral surface, also with Newton's method), or if the approach is larger than
-        `covered`, m: the caller then adds candidates.
+        It is not tried if the gap residual is at least the force residual: the nodes oscillate on
+        the femoral surface, also with Newton's method. Nor is it tried if the approach is larger
+        than `covered`, m, because the caller then adds candidates.
         """
         if self.newton:
             return solve_by_newton(problem, pose, load, guess, settings)

@@ -10,9 +10,9 @@ Newton), accelerated by Anderson's method (Walker & Ni, SIAM J Numer Anal 49:171
 doi:10.1137/10078356X). The softening s is the ratio of secant and tangent stiffness along u, so
 that K/s approximates the tangent stiffness.
 
-An element's share of h grows with a power of its strain (4.5 for polyethylene), so passes evaluate
+An element's share of h grows with a power of its strain (4.5 for polyethylene). So passes evaluate
 only the `Region` of the largest shares. The other shares and the rounding error of the factor
-change little: they are measured with the whole solid (`NonlinearBalance.measure`), and constant
+change little. They are measured with the whole solid (`NonlinearBalance.measure`), and are constant
 until the next measurement.
 """
 

@@ -222,9 +222,10 @@ def _pressures(
 def _gaps(state: LatticeState, pose: Array, gaps: Array, force: Array, solution: Solution) -> Array:
     """Return (c,), m.
 
-    They are of the deformed insert in and beside the contact, and where the undeformed bodies
-    overlap; elsewhere `gaps` of the undeformed insert at this pose. The edge of contact depends on
-    those beside it, but the candidates on the initial guess: a gap there is computed for any node.
+    They are those of the deformed insert in and beside the contact, and where the undeformed bodies
+    overlap. Elsewhere they are `gaps` of the undeformed insert at this pose. The edge of contact
+    depends on those beside it, but the candidates on the initial guess: a gap there is computed for
+    any node.
     """
     loaded: Mask = np.asarray(force.any(axis=1), bool)
     close = beside(state.surface.triangles, loaded) | loaded | (gaps < 0)

@@ -154,7 +154,7 @@ class SlidingNodes:
 
     Each pass solves the contact on tangent planes, then new rays through the displaced nodes give
     the next ones. Where the femoral normal turns quickly (a rim, a coarse triangle) the nodes can
-    oscillate; the rays then follow them only part of the way. Points and displacement (m, 3), m,
+    oscillate. The rays then follow them only part of the way. Points and displacement (m, 3), m,
     are those of the undeformed candidates.
     """
 

@@ -3,13 +3,13 @@
 Nodes in contact get the vertical displacement that brings them onto the femoral component, and
 slide freely in x and z; all others have no load (section 4.5.5; docs/lattice.md).
 
-Linear: a unit displacement of these nodes gives the slope of the reaction F, and one correction of
-the approach D the load, if the contact set does not change. Nonlinear: at fixed D, Newton steps
-with the tangent springs bring the free nodes to equilibrium, then D_new = D (load/F)^(1/m).
+Linear: a unit displacement of these nodes gives the slope of the reaction F. One correction of the
+approach D then gives the load, if the contact set does not change. Nonlinear: at fixed D, Newton
+steps with the tangent springs bring the free nodes to equilibrium, then D_new = D (load/F)^(1/m).
 Penetrated nodes are added, nodes in tension released.
 
-No step factorises a matrix: `prepare` stores the factor of the undeformed insert, K = L Lᵀ, and the
-response of the held unknowns, Z = L⁻¹ E (the columns of E are their unit forces), with which
+No step factorises a matrix. `prepare` stores the factor of the undeformed insert, K = L Lᵀ, and the
+response of the held unknowns, Z = L⁻¹ E (the columns of E are their unit forces). With these,
 
     P = L⁻ᵀ (1 − Z (ZᵀZ)⁻¹ Zᵀ) L⁻¹
 

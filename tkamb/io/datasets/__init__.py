@@ -1,7 +1,7 @@
 """Measured data for the shipped scenes, which only `tkamb data get` downloads.
 
 Each data set lists files with published address and SHA-256, which is checked before a file is
-written; a repeated download loads only missing files.
+written. A repeated download loads only missing files.
 """
 
 import json
@@ -86,7 +86,9 @@ TIMEOUT_S = 30
 
 @dataclass
 class Got:
-    """Args:
+    """Result of fetching a data set.
+
+    Args:
     absent: names of files that fetching did not find.
     """
 

@@ -52,8 +52,9 @@ class Leg:
     def knee_centre(self) -> Array:
         """(3,) m, the knee's centre in ground in the neutral position.
 
-        It is the origin of the knee joint's frame on the femur, or on the tibia in Delp's models,
-        where the former is at the hip because the joint's translation includes the thigh's length.
+        It is the origin of the knee joint's frame on the femur. In Delp's models this is at the
+        hip, because the joint's translation includes the thigh's length. There it is the origin of
+        the frame on the tibia.
         """
         hip = transform(self.neutral[self.hip_centre[0]], self.hip_centre[1])
         for group in (self.femur, self.tibia):

@@ -184,7 +184,7 @@ def _from_plates(request: ImportRequest, side: str, axes: str, feet: Feet) -> Fo
 def _from_table(
     request: ImportRequest, path: Path, side: str, axes: str, feet: Feet | None
 ) -> FoundGround:
-    """They are chosen by --grf-force, by name, or by point of application."""
+    """The forces are chosen by --grf-force, by name, or by point of application."""
     table = read_table(path)
     forces = table_forces(table)
     time = table.time()
@@ -225,8 +225,9 @@ def _from_table(
 
 
 def _axes_of_table(table: Table, forces: list[TableForce], axes: str) -> str:
-    """These are usually the recording's axes that point forward, up and right; but OpenSim's x, y,
-    z are its x, z, -y if its z points up and the table's largest force is along y.
+    """Return the table's axes that point forward, up and right, usually those of the recording. If
+    the recording's z points up and the table's largest force is along y, the table has OpenSim's
+    axes: its x, y, z are the recording's x, z, -y.
     """
     if not forces or axes.split(",")[1][-1] != "z":
         return axes
@@ -444,7 +445,7 @@ def _loaded_points(forces: list[RecordedForce]) -> tuple[Array, Array]:
 
 def _distance(time: Array, point: Array, clock: Array, middle: Array) -> tuple[float, float]:
     """Return the horizontal distance (m) that `percentile` of the points keep from the foot, and
-    the share of the points at times of the motion, which alone count.
+    their share.
 
     Args:
         time: (n,) s, times of the points.

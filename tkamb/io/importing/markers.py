@@ -205,7 +205,7 @@ class Facing:
 def facing(segments: list[ModelSegment], recorded: Table) -> Facing:
     """Return the directions of the recording's axes by thigh, shank and pelvis.
 
-    In each segment y points up and x forward; the mean over frames and segments decides the nearest
+    In each segment y points up and x forward. The mean over frames and segments decides the nearest
     axes of the file.
     """
     upright = [s for s in segments if s.name in ("shank", "thigh", "pelvis")]

@@ -152,8 +152,9 @@ class ModelChain:
     def _free_part(self, values: Array, state: Array) -> Array:
         """Return the rows, and for a square matrix also the columns, of the free coordinates.
 
-        By the chain rule, the row (and column) of a dependent coordinate times its coupler's slope
-        is added to that of the independent one, in a series of couplers the last one first.
+        By the chain rule, the row (and column) of a dependent coordinate, times its coupler's
+        slope, is added to that of the independent one. In a series of couplers the last one is
+        added first.
         """
         square, free = values.shape[1] == values.shape[2], len(self.free)
         for dependent, independent, coordinate, function in reversed(self._after):

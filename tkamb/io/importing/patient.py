@@ -186,7 +186,7 @@ def _trial(request: ImportRequest, leg: Leg, links: Links, insert: Surface | Non
 def write_patient(patient: ImportedPatient, folder: Path, name: str) -> tuple[str, ...]:
     """Write URDF and scene, load them as a check, and return remarks on markers and gait.
 
-    Existing files do not change, and scenes may share one with the same content; after an error all
+    Existing files do not change, and scenes may share one with the same content. After an error all
     new files are removed.
     """
     scene = folder / name
@@ -306,7 +306,7 @@ def _leg_scale(request: ImportRequest, leg_mass: float) -> tuple[float, str]:
     """Return the factor on the masses of a model of one leg, and a remark on it.
 
     The model has the mass of a leg, or of the whole body if a scaling tool scaled it to the
-    subject's; if the factor is not 1, the leg gets `LEG_MASS_SHARE` of the subject's mass.
+    subject's mass. If the factor is not 1, the leg gets `LEG_MASS_SHARE` of the subject's mass.
 
     Args:
         leg_mass: mass of thigh, shank and foot in the model, kg.

@@ -1,7 +1,7 @@
 """Knee and shank poses: recorded poses of the components, or coordinates of an OpenSim model.
 
-Fluoroscopy or biplane X-ray gives no pose of the leg in the laboratory: the shank's comes from its
-markers, and from joint centres fixed to the neighbouring segments' markers.
+Fluoroscopy or biplane X-ray gives no pose of the leg in the laboratory. The shank's pose comes from
+its markers, and from joint centres fixed to the neighbouring segments' markers.
 """
 
 from collections.abc import Mapping
@@ -178,7 +178,7 @@ def shank_markers(
 ) -> ShankMarkers:
     """Return the points that give the shank's pose.
 
-    They are the shank's markers if there are three, otherwise joint centres are added: the ankle's
+    They are the shank's markers if there are three. Otherwise joint centres are added: the ankle's
     from three markers of the foot, the knee's from three of the thigh. The knee centre's place in
     the shank is its mean over the recorded poses.
 

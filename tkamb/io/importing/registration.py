@@ -10,9 +10,9 @@ of the knee from the model's),
 
 The second sum keeps the knee a joint: its coordinates k other than flexion may leave the model's
 neutral values k̄ by a few millimetres and degrees. Gauss-Newton steps eliminate the frames (Schur's
-complement), with Pinocchio's Jacobians. σ_m follows from the residuals, and c is the number of
-frames per independent observation, because skin moves alike in each stride and slowly within it;
-the inverse of the reduced matrix is the covariance of θ.
+complement), with Pinocchio's Jacobians. σ_m follows from the residuals. Skin moves alike in each
+stride and slowly within it, so c is the number of frames per independent observation. The inverse
+of the reduced matrix is the covariance of θ.
 
 References: Reinbolt et al., J Biomech 38:621 (2005), doi:10.1016/j.jbiomech.2004.03.031; Andersen
 et al., Comput Methods Biomech Biomed Eng 13:171 (2010), doi:10.1080/10255840903067080; Werling et

@@ -1,7 +1,7 @@
 """XML of an OpenSim file and of the files that it includes.
 
 OpenSim's reader accepts a bare `&` in a text, bytes that are not UTF-8, `--` within a comment and
-text after the last element; tkamb does, too, with a notice. An element with `file="other.xml"` is
+text after the last element. So does tkamb, with a notice. An element with `file="other.xml"` is
 replaced by the element in the other file. If an element lacks a value, the value is read from the
 file's <defaults>.
 """

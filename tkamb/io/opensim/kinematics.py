@@ -6,9 +6,9 @@ ground's origin (angular above linear velocity). Then a point p of the body has 
 
     ∂p/∂q = J_linear + J_angular × p.
 
-The twist of a joint's outboard body is that of the inboard body plus a term for each axis: (d, c ×
-d) du/dq for a rotation by u(q) about the line through c along d, (0, d) du/dq for a translation. In
-a backwards joint, whose child is nearer to ground, the term has the opposite sign.
+The twist of a joint's outboard body is that of the inboard body plus a term for each axis. For a
+rotation by u(q) about the line through c along d it is (d, c × d) du/dq, for a translation (0, d)
+du/dq. In a backwards joint, whose child is nearer to ground, the term has the opposite sign.
 """
 
 from collections.abc import Mapping, Sequence

@@ -146,7 +146,7 @@ def simm_spline(x: Array, y: Array) -> Piecewise:
 
 
 def _third_difference(x: Array, y: Array) -> float:
-    """f'''/6 of the cubic through four points."""
+    """Return f'''/6 of the cubic through four points."""
     for order in (1, 2, 3):
         y = np.diff(y) / (x[order:] - x[:-order])
     return float(y[0])

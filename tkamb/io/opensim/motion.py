@@ -7,8 +7,8 @@ generalised forces are
     τ = Σ_b J_bᵀ (dh_b/dt - (c × m g, m g) - w_b).
 
 Accelerations are computed from ground outwards: a joint axis s with the angle or translation u(q)
-adds s ü + (v × s) u̇, with the twist v of the previous body or axis and the cross product × of
-twists. Within a joint, the translations precede the rotations.
+adds s ü + (v × s) u̇. Here v is the twist of the previous body or axis, and × is the cross product
+of twists. Within a joint, the translations precede the rotations.
 
 Reference: Featherstone, Rigid Body Dynamics Algorithms (2008), chapters 2 and 5.
 """

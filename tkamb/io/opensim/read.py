@@ -2,7 +2,7 @@
 
 tkamb reads the layout of OpenSim 4 (sockets, offset frames, sets of joints), the older layout
 (joints nested in their bodies), and sets in separate files. An element that cannot be read is an
-error, or in a partial reading listed in `unread`; elements that tkamb does not model, such as
+error, or in a partial reading listed in `unread`. Elements that tkamb does not model, such as
 contact forces, are in `left_out`.
 """
 

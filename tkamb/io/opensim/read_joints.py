@@ -281,7 +281,7 @@ def _named_axes(
 ) -> list[tuple[str, Element]]:
     """Return a joint's axes in the order in which they act.
 
-    As in OpenSim, an axis' name decides its place, not its position in the file; axes without any
+    As in OpenSim, an axis' name decides its place, not its position in the file. Axes without any
     are in the order of `AXES`.
     """
     entries: dict[str, Element] = {}
@@ -344,8 +344,8 @@ def _is_angle_of(axis: JointAxis, coordinate: str) -> bool:
 def outwards(document: Document, joints: list[Joint], bodies: Iterable[str]) -> tuple[Joint, ...]:
     """Return the joints in order from ground outwards, with `backwards` set.
 
-    A partial reading leaves out a joint that closes a loop, and welds to ground, as unread, a body
-    that no chain of joints connects with it.
+    A partial reading leaves out a joint that closes a loop. It welds a body that no chain of joints
+    connects with ground to ground, and marks the weld as unread.
     """
     path = document.path
     reached, waiting, ordered = {GROUND}, list(joints), []

@@ -1,8 +1,8 @@
 """C3D recordings: markers, force plates and other analog channels, in SI, with gaps as NaN.
 
-Frame k of the file is at the time (first frame + k)/rate, the first one counted from zero, so that
-a trial cut out of a longer one keeps its times. A marker with a negative residual, or at exactly
-(0, 0, 0), is missing in that frame: a gap.
+Frame k of the file is at the time (first frame + k)/rate. The first frame is counted from zero, so
+that a trial cut out of a longer one keeps its times. A marker with a negative residual, or at
+exactly (0, 0, 0), is missing in that frame: a gap.
 
 An error in markers, channels or one plate is raised only when that part is used.
 
@@ -347,7 +347,7 @@ class _Reader:
         )
 
     def _per_plate(self, key: str, rows: tuple[int, ...] | None) -> Array | None:
-        """Return the numbers in the shape `rows` per plate, which is the last index; the file may
+        """Return the numbers in the shape `rows` per plate, which is the last index. The file may
         lack it for one plate.
 
         None: the parameter is missing or of another size.
@@ -378,7 +378,7 @@ class _Reader:
         """Return the samples that FORCE_PLATFORM:ZERO states as unloaded, or None.
 
         Its two frame numbers are those of a longer recording, of which this one is a part, if both
-        lie within this one; otherwise they count from its first frame.
+        lie within this one. Otherwise they count from its first frame.
         """
         frames = self._parameters.integers("FORCE_PLATFORM:ZERO")
         if len(frames) != 2 or frames[1] < 1 or frames[1] < frames[0]:

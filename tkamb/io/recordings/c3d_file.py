@@ -389,7 +389,7 @@ class _Data:
         )
 
     def _start(self, notices: list[str]) -> int:
-        """Header and POINT:DATA_START both state the first block of the data; if they differ, the
+        """Header and POINT:DATA_START both state the first block of the data. If they differ, the
         frames must fit the file from exactly one of the two.
         """
         stated = self.parameters.integers("POINT:DATA_START")
@@ -424,7 +424,7 @@ class _Data:
         return max(first - 1, 0)
 
     def _stated(self) -> int:
-        """The header's frame numbers have 16 bits; longer recordings state the number in the two
+        """The header's frame numbers have 16 bits. Longer recordings state the number in the two
         words of TRIAL, or else in POINT:LONG_FRAMES or POINT:FRAMES.
         """
         wrap = LARGEST_16_BIT + 1
@@ -483,7 +483,7 @@ class _Data:
         """Return positions (n, m, 3) and residuals (n, m) in the file's unit, gaps NaN.
 
         A marker's fourth word has the cameras in its high byte and the residual, in units of the
-        scale, in its low byte; it is negative if the marker is missing.
+        scale, in its low byte. It is negative if the marker is missing.
         """
         scale = abs(self.header.scale)
         positions = words[:, :, :3] * (1.0 if self._word == 4 else scale)

@@ -10,10 +10,10 @@ cut-off f_c, no phase shift. Unlike that filter, it accepts uneven samples, and 
 derivatives belong to one smooth curve.
 
 The ends are natural, without padding, unless `periodic=True` closes the curve: the last sample is
-then the first one of the next cycle. Example, a 1 Hz wave with a cut-off of 6 Hz: the root mean
-square error of its acceleration, as a share of the amplitude, is 0.23 at an end, and 0.06, 0.013
-and 0.002 at a quarter, a half and one period of the cut-off from it. A two-pass Butterworth filter
-with reflected ends has 0.64, 0.16, 0.11 and 0.02.
+then the first one of the next cycle. Example: a 1 Hz wave with a cut-off of 6 Hz. The root mean
+square error of its acceleration, as a share of the amplitude, is 0.23 at an end. At a quarter, a
+half and one period of the cut-off from it, it is 0.06, 0.013 and 0.002. A two-pass Butterworth
+filter with reflected ends has 0.64, 0.16, 0.11 and 0.02.
 
 `cutoff_Hz = "none"` interpolates the samples with a quintic spline.
 
@@ -165,7 +165,7 @@ def _check_samples(time: Array, values: Array, at: Array, name: str) -> None:
 def check_frames(time: Array, cutoff_Hz: Cutoff, frames: int | None) -> None:
     """Raise an InputError if the resampled times (f,) s are too far apart for the cut-off.
 
-    A recording is filtered at its own samples before it is resampled; results at the frames (a
+    A recording is filtered at its own samples before it is resampled. Results at the frames (a
     solved patella, a rolling femur) are filtered at the frames' rate.
 
     Args:

@@ -13,7 +13,7 @@ channels give the force and the moment about the transducers' origin in these ax
     type 5   as type 2 after a calibration matrix (6, 8) of eight channels
 
 A calibration matrix gives forces in N (or FORCE_PLATFORM:UNITS) and moments in that unit times
-POINT:UNITS. A type 4 plate may state other units; the units that put the centre of pressure on the
+POINT:UNITS. A type 4 plate may state other units. The units that put the centre of pressure on the
 plate are then used.
 
 ORIGIN is the vector o from the transducers' origin to the surface's centre, about which the moment

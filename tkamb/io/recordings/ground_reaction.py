@@ -267,7 +267,7 @@ def _odd_samples(
 ) -> tuple[OddSample, ...]:
     """Return the odd samples of force and recorded point (n, 3) under load.
 
-    The low-pass filter spreads one sample over the time 1 / (2 cutoff); forces that are small
+    The low-pass filter spreads one sample over the time 1 / (2 cutoff). Forces that are small
     afterwards are not returned.
     """
     if not loaded.any():
@@ -352,7 +352,7 @@ def _check_size(path: Path, kind: str, column: str, values: Array) -> None:
 
 def _read_plates(source: GroundReactionTable) -> RecordedReaction:
     """The loaded plates' wrenches are summed about the laboratory's origin. The point lies on the
-    plates' surface, or on a step `surface_mm` higher, and is interpolated in time below
+    plates' surface, or on a step `surface_mm` higher. It is interpolated in time below
     `unloaded_N`.
     """
     recording = read_c3d(source.file, _units(source))

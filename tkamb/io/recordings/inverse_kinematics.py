@@ -5,10 +5,10 @@ markers x_m(q),
 
     min_q  sum_m w_m |x_m(q) - p_m|²
 
-is solved by Gauss-Newton steps with Levenberg's damping and analytic Jacobians, near the solution
-by Newton's method if the chain gives the curvature of the residuals. All frames are independent and
-solved at once: every array has them as its first axis. No bounds are imposed, so that a coordinate
-outside its range is visible.
+is solved by Gauss-Newton steps with Levenberg's damping and analytic Jacobians. Near the solution
+Newton's method is used if the chain gives the curvature of the residuals. All frames are
+independent and solved at once: every array has them as its first axis. No bounds are imposed, so
+that a coordinate outside its range is visible.
 
 Reference: Lu & O'Connor, J Biomech 32:129 (1999), doi:10.1016/S0021-9290(98)00158-4.
 """

@@ -1,7 +1,7 @@
 """Unit words of recordings, and columns in the laboratory (x forward, y up, z right) in SI.
 
-Case, blanks, dots, hyphens and asterisks are ignored, and only the listed words are units: no unit
-is guessed, and a reader that needs the quantity raises an error.
+Case, blanks, dots, hyphens and asterisks are ignored, and only the listed words are units. No unit
+is guessed: a reader that needs the quantity raises an error.
 """
 
 from dataclasses import dataclass

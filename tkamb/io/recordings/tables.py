@@ -159,7 +159,7 @@ def read_csv(path: Path) -> Table:
     """Read comma-separated values with one header row.
 
     Semicolons or tabs may separate the cells, with points or commas in the numbers; a notice says
-    so. Lines that are empty or begin with # are skipped, and empty cells after the last named
+    so. Lines that are empty or begin with # are skipped. So are empty cells after the last named
     column, because some programs end every line with a comma.
     """
     lines = [
@@ -442,8 +442,8 @@ SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
 def read_lines(path: Path) -> list[str]:
     """Return the lines of a text file.
 
-    A byte order mark decides the encoding; without one it is UTF-8, or Latin-1, which older
-    programs write, if the bytes are not valid UTF-8.
+    A byte order mark decides the encoding; without one it is UTF-8. If the bytes are not valid
+    UTF-8, it is Latin-1, which older programs write.
     """
     content = read_bytes(path, TABLE_BYTES)
     encodings = [name for mark, name in BYTE_ORDER_MARKS.items() if content.startswith(mark)]

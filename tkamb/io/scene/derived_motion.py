@@ -19,7 +19,7 @@ def seated_motion(
 ) -> KneeMotion:
     """Return the motion with an initial guess of the coordinates that were not recorded.
 
-    Unrecorded rotations are zero, AP and ML place the mean of the condyles' lowest points above the
+    Unrecorded rotations are zero. AP and ML place the mean of the condyles' lowest points above the
     insert's origin, and SI lowers the femur to first touch. The rates of this guess determine
     inertia forces and the direction of sliding.
 

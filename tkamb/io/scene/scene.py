@@ -1,6 +1,6 @@
 """The scene: the TOML file that says what exists and what is modelled.
 
-Units are in the key names, paths are relative to the file, an unknown key is an error, and the
+Units are in the key names, paths are relative to the file, and an unknown key is an error. The
 subject of an absent table is not modelled. `load_scene` does not read the files that the scene
 names.
 """

@@ -1,6 +1,6 @@
 """The scene's table [uncertainty]: the standard deviation of the error of each input.
 
-A key is the standard deviation of a normal error, in its unit, or if called relative that of a
+A key is the standard deviation of a normal error, in its unit. A key called relative is that of a
 positive (lognormal) factor with mean 1. Zero: the input does not vary.
 """
 

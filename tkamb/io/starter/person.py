@@ -3,8 +3,9 @@
 Lengths are shares of body height (Drillis and Contini 1966, as in Winter 2009, figure 4.1): ankle
 0.039, shank 0.246, thigh 0.245. Masses and inertias are from de Leva (1996), see
 `tkamb.io.recordings.patient`. Joint centres, attachments on the femoral shaft, the ground reaction
-and its point are scaled; the implant and attachments near the knee move with it. A left leg is the
-mirror image: positions along z, the force to the right, and the meshes change sign.
+and its point are scaled. The implant and attachments near the knee are not scaled, but move with
+the knee. A left leg is the mirror image: positions along z, the force to the right, and the meshes
+change sign.
 
 References: Winter (2009), Biomechanics and Motor Control of Human Movement, 4th ed., Wiley,
 doi:10.1002/9780470549148; de Leva (1996), J Biomech 29:1223, doi:10.1016/0021-9290(95)00178-6.

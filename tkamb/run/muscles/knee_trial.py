@@ -1,7 +1,7 @@
 """Static optimisation for a leg with tkamb's knee in place of the OpenSim model's knee.
 
-The OpenSim model provides the rows of hip, ankle and subtalar joint, in each frame the equations of
-tkamb's knee the row of the knee: the moment and the moment arms (`tkamb.knee.crossing`).
+The OpenSim model provides the rows of hip, ankle and subtalar joint. In each frame tkamb's knee
+provides its own row: the moment and the moment arms (`tkamb.knee.crossing`).
 
 Let W be the wrench on the shank of all loads but contact, about a point at the height of the
 contact. With the condyles' contact points at z_m and z_l, superior-inferior force and frontal
@@ -10,7 +10,7 @@ moment give
     N_m + N_l = W_y,    z_m N_m + z_l N_l = -W_x,   W_x: moment about AP.
 
 W is affine in the muscle forces, and so are N_m and N_l. With the flexion moment alone the optimum
-lets a condyle lift off as soon as the load from outside allows it, which measured knees do not: the
+lets a condyle lift off as soon as the load from outside allows it. Measured knees do not: the
 medial condyle carries 60 to 80 % of the load in walking (PMC2965044, with references). With a least
 share s of each condyle, the optimisation has two more rows,
 

@@ -188,8 +188,8 @@ def length_twins(model: OpenSimModel) -> dict[str, str]:
     """Return muscle -> its twin, if it has one.
 
     A twin is a copy with the same strength, fibre length, tendon length and first point, but fewer
-    path points, for a path past the patella to the tibia. Its path has the length of muscle and
-    tendon; it must not pull itself.
+    path points. Models have twins for paths past the patella to the tibia. Its path has the length
+    of muscle and tendon; it must not pull itself.
     """
     pairs = [p for p in combinations(model.muscles.values(), 2) if _same_muscle(*p)]
     ordered = [sorted(pair, key=lambda muscle: len(muscle.path.points)) for pair in pairs]

@@ -82,7 +82,9 @@ class SharedMuscles:
 
 @dataclass(frozen=True, eq=False)
 class FrameMuscles:
-    """Args:
+    """The muscles of a leg in one frame.
+
+    Args:
     lines: muscle lines across the knee in this frame of the `trial`.
     """
 

@@ -1,7 +1,7 @@
 """Static optimisation: the muscle activations of least cost for the joint moments of one frame.
 
 For given activations a (n,), the equations of motion are a square system for the other unknowns y
-(m,), here the reserves, and y is affine in a:
+(m,), here the reserves. So y is affine in a:
 
     A_d y + A_f F a = b     =>     y = offset + gain a,
     offset = A_d^-1 b,      gain = -A_d^-1 A_f F

@@ -4,21 +4,21 @@ In each frame,
 
     τ_c = Σ_i R_ci (a_i F_i + P_i) + r_c.
 
-τ are the generalised forces of the motion (inertia, gravity, external loads), R = -dL/dq the moment
-arms about the balanced coordinates c, F_i a muscle's force at full activation, P_i its passive
-force, and the reserve r_c the moment that the muscles lack. Activations a and reserves minimise,
-with w, p and the reserve sizes ρ of `Sharing`,
+τ are the generalised forces of the motion (inertia, gravity, external loads), and R = -dL/dq the
+moment arms about the balanced coordinates c. F_i is a muscle's force at full activation, P_i its
+passive force. The reserve r_c is the moment that the muscles lack. Activations a and reserves
+minimise, with w, p and the reserve sizes ρ of `Sharing`,
 
     Σ_i w_i a_i^p + Σ_c (r_c / ρ_c)²,   lowest <= a_i <= highest.
 
-A taut line is a chain of straight parts between points on bones and on their wrap objects, whose
-ends on a bone are the line's effective attachments. A part from bone A at p to bone B at q pulls A
+A taut line is a chain of straight parts between points on bones and on their wrap objects. The ends
+of its parts on a bone are its effective attachments. A part from bone A at p to bone B at q pulls A
 at p along u = (q - p)/|q - p|, and B at q along -u. The virtual work of the wrenches w on the bones
 gives the moment arm,
 
     Σ_bones J_boneᵀ w_bone = -dL/dq.
 
-Wrap objects that a point inside them displaces (docs/opensim.md) push on their bone, too; path
+A wrap object that a point inside it displaces (docs/opensim.md) pushes on its bone, too. Path
 points that move within their bone (quadriceps of gait2392) do work without a wrench on any bone.
 """
 
@@ -175,8 +175,8 @@ class MuscleTrial:
     def knee_reaction(self) -> Array:
         """Return the wrench (f, 6) of the femur on the tibia without the muscles, mainly contact.
 
-        It is what the motion of tibia and foot requires minus gravity, external loads and muscles:
-        moment (N·m) and force (N) in the tibia's frame, about its origin.
+        It is what the motion of tibia and foot requires minus gravity, external loads and muscles.
+        It has moment (N·m) and force (N) in the tibia's frame, about its origin.
 
         Raises:
             InputError: muscles end on the patella, and the force of the patellar ligament is

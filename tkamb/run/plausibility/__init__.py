@@ -1,6 +1,6 @@
 """Plausibility of a case: a question for each possible but unlikely input.
 
-An impossible input is refused when it is read; a case with an unlikely one is computed, and a
+An impossible input is refused when it is read. A case with an unlikely one is computed, and a
 question names the likely mistake in summary, report and the status of the frames. The limits are
 wide, since mistakes such as wrong signs and units exceed them by far.
 """

@@ -133,8 +133,8 @@ def step_questions(case: Case) -> Iterator[Question]:
 def direction_questions(case: Case) -> Iterator[Question]:
     """Ask about an unlikely direction of the horizontal force.
 
-    The ground reaction passes near the body's centre of mass, and so near the hip: it is inclined
-    forward or backward like the line from the centre of pressure to the hip, and inward.
+    The ground reaction passes near the body's centre of mass, and so near the hip. It is therefore
+    inclined forward or backward like the line from the centre of pressure to the hip, and inward.
     """
     ground, loaded = case.ground, _well_loaded(case)
     yield from _sideways_question(case)

@@ -1,6 +1,6 @@
 """Computation of a cohort, from its file to the written results.
 
-Workers compute the runs, each of which is stored at once; at the end the table of all frames,
+Workers compute the runs, each of which is stored at once. At the end the table of all frames,
 runs.csv, groups.csv, cohort.json and the report are written together.
 """
 
@@ -163,7 +163,9 @@ MOST_SHARDS = 10_000
 
 @dataclass(frozen=True)
 class Part:
-    """Args:
+    """Part of a cohort's runs that one job of a batch queue computes.
+
+    Args:
     index: number of the part of the runs, from 1 to `count`, that one job of a batch queue
         computes.
     """

@@ -2,13 +2,13 @@
 
 The J-curve is a chain of circular arcs with common tangents. A point of the articular surface has
 two coordinates: phi, the angle of the normal of the sagittal profile, and z, the mediolateral
-position; it lies `depth` below the profile along the inward normal. Every condyle is therefore a
+position. It lies `depth` below the profile along the inward normal. Every condyle is therefore a
 piece of a torus, with the sagittal radius at the ridge and the coronal radius across it. If the
 J-curves of the two condyles differ, the surface blends from one to the other in the groove.
 
-A posterior-stabilised component has a cam, a cylinder that joins the two walls of the box: exact up
-to `FLANGE_MM` from a wall, where it widens to the edge of an opening in it, so the mesh is one
-closed body without self-intersection.
+A posterior-stabilised component has a cam: a cylinder that joins the two walls of the box. It is
+exact up to `FLANGE_MM` from a wall. There it widens to the edge of an opening in the wall, so the
+mesh is one closed body without self-intersection.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,7 @@
 """An insert: a height field with two dishes over a kidney-shaped outline, flat below.
 
 Each dish is a coronal arc moved along a sagittal arc, so both curvatures are exact at its lowest
-line; the eminence between is an arc tangent to both.
+line. The eminence between is an arc tangent to both.
 """
 
 from dataclasses import dataclass

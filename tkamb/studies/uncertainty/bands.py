@@ -229,7 +229,9 @@ def measured_inside(
 
 @dataclass(frozen=True)
 class Influence:
-    """Args:
+    """Influence of one input on one result.
+
+    Args:
     name: of the input, or "rest" for variance that no function of one input explains.
     share: in the variance of the result, summed over all frames.
     change: of the result per standard deviation of the input, linear, at the frame of the

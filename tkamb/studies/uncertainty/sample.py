@@ -1,6 +1,6 @@
 """One sample of a scene: inputs with errors, and the results as one array.
 
-Errors are applied to the loaded case, in SI units and for a right knee: only a varied modulus of
+Errors are applied to the loaded case, in SI units and for a right knee. Only a varied modulus of
 the insert needs a new preparation of the contact.
 
 Each skin marker is displaced on its segment by an error that is constant over the frames. The rigid

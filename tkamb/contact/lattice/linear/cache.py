@@ -3,8 +3,8 @@
 The key of a file is the SHA-256 of everything that its operator depends on: nodes, cells, held
 unknowns, contact nodes, elastic constants, kind of solid, and tkamb's own code. A file is a NumPy
 archive (.npz, not compressed) of the key and the operator's arrays. Each array has a CRC-32. A file
-is written under a temporary name and then renamed, so that other processes never read half a file,
-and read into memory: one that is cut short in use does no harm.
+is written under a temporary name and then renamed, so that other processes never read half a file.
+It is read into memory: one that is cut short in use does no harm.
 
 A file is used only if
 - it is a regular file of this user, and nobody else may write it;

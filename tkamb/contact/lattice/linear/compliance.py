@@ -2,8 +2,8 @@
 
 K = L Lᵀ is the stiffness, and the columns of E are unit forces on the contact nodes' unknowns. With
 Z = L⁻¹ E the compliance is Eᵀ K⁻¹ E = Zᵀ Z, so that no backward solve is needed. A column of Z is
-zero except on the path from its node to the root of the elimination tree, so Z is stored as one
-dense block per front (node of this tree), column by column: a product for few nodes reads only
+zero except on the path from its node to the root of the elimination tree. So Z is stored as one
+dense block per front (node of this tree), column by column. A product for few nodes reads only
 their columns.
 """
 

@@ -87,11 +87,13 @@ class TooLittleMemoryError(ComputationError):
 
 
 def check_memory(need: float, likely: float = 0.0) -> None:
-    """Args:
+    """Raise unless the `need` (bytes) of the next step is available.
+
+    Args:
         likely: expected memory for the whole computation, bytes; for the advice.
 
     Raises:
-        TooLittleMemoryError: it is not.
+        TooLittleMemoryError: it is not available.
     """
     available = available_memory()
     if MEMORY_NEED.safety_factor * need > available:
@@ -263,8 +265,8 @@ def fixed_unknowns(
 
     A fixed bearing holds all unknowns of the bottom nodes. A mobile bearing holds their y. It also
     holds x of the two end nodes along z (those nearest to x = 0) and z of the node nearest to the
-    middle, which prevents rigid motion and allows every strain. Each separate piece of the insert
-    is held so.
+    middle. This prevents rigid motion and allows every strain. Each separate piece of the insert is
+    held so.
 
     Args:
         nodes: m, (n, 3).

@@ -88,8 +88,8 @@ def _reference_layers(top: Array, thinnest: float, thickest: float, spacing: flo
     """Return the number of layers that can follow the largest part of the top surface.
 
     They end in a step where the top is more than half a layer too low for them. The edge of a step
-    has cells on one side only and is too soft, so steps are allowed only on parts higher than the
-    dishes, which no condyle meets.
+    has cells on one side only and is too soft. Steps are therefore allowed only on parts higher
+    than the dishes, which no condyle meets.
     """
     candidates = np.arange(1, int(np.ceil(top.max() / thinnest)) + 1)
     stepped = np.array([np.mean(top < (n - 0.5) * thinnest) for n in candidates])
@@ -346,8 +346,8 @@ def refired_inwards(
 ) -> Array:
     """Return the heights (n,), m, of nodes that are moved onto walls.
 
-    A vertical ray on a rough wall may miss: the target (n, 3), m, is then moved inside by
-    `wall_inset` along `inward` (n, 2), x and z, in place, and the ray repeated.
+    A vertical ray on a rough wall may miss. The target (n, 3), m, is then moved inside by
+    `wall_inset` along `inward` (n, 2), x and z, in place, and the ray is repeated.
     """
     height = refired(field, nodes, target, rays)
     missed = np.flatnonzero(~np.isfinite(height))

@@ -76,9 +76,9 @@ def consistent_areas(points: Array, squares: Index) -> Array:
 
         A_i = sum over faces of the integral of N_i dA
 
-    A uniform pressure p has the consistent nodal forces p A_i: force over area is p at every node,
-    also at corners, oblique outlines and near-triangles, while equal shares of the triangles would
-    depend on the diagonals.
+    A uniform pressure p has the consistent nodal forces p A_i, so that force over area is p at
+    every node, also at corners, oblique outlines and near-triangles. Equal shares of the triangles
+    would depend on the diagonals.
 
     Points (n, 3) are in m, squares (m, 4) the nodes around each face.
 

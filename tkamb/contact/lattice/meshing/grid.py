@@ -145,7 +145,7 @@ def _sorted_faces(cells: Index) -> tuple[Index, Mask]:
     """Return the faces of all cells, the two copies of an inner face next to each other.
 
     The smallest and the largest node identify a face of a grid. Each is 6 cell + row of `FACES`,
-    (6c,); whether it is the same as the next one, (6c - 1,).
+    (6c,). Also returns whether it is the same face as the next one, (6c - 1,).
     """
     ends = np.sort(cells[:, FACES].reshape(-1, 4), axis=1)[:, [0, 3]]
     order = np.lexsort((ends[:, 1], ends[:, 0]))

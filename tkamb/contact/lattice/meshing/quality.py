@@ -1,7 +1,7 @@
 """The quality of a lattice: volume, edges, corners, shear and corrections.
 
-It can lose features thinner than a cell, and parts of a faulty mesh, which a contact does not show:
-`whole_lattice` rejects a volume that differs by more than 2 %.
+A lattice can lose features thinner than a cell, and parts of a faulty mesh, which a contact does
+not show. `whole_lattice` rejects a volume that differs by more than 2 %.
 """
 
 import logging

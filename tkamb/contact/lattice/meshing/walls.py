@@ -1,7 +1,7 @@
 """Sideways moves of nodes onto walls, which vertical rays do not meet, and into notches.
 
-Walls: if a node has no cell beside it, a ray along x or z finds the wall: within half a cell the
-node is moved onto it, otherwise the next node outside is moved inwards onto it.
+Walls: if a node has no cell beside it, a ray along x or z finds the wall. Within half a cell the
+node is moved onto it; otherwise the next node outside is moved inwards onto it.
 
 Notches: a grid follows an oblique surface in steps, and each leaves a wedge that belongs to no
 cell. The node outside of it is moved into the corner of the part, or on a straight surface almost
@@ -125,7 +125,7 @@ def _towards(point: Array, goal: Array, share: float, rise: Array | float) -> Ar
 def _add_members(field: NodeField, notch: Notch, target: Array, usable: Mask, flat: bool) -> None:
     """Make the usable nodes members.
 
-    In a horizontal square, one between two top nodes becomes a top node; otherwise forces on the
+    In a horizontal square, one between two top nodes becomes a top node. Otherwise forces on the
     other nodes of its cell's upper face would be too large.
     """
     rejected, added = (tuple(n[mask] for n in notch.node) for mask in (~usable, usable))
