@@ -90,7 +90,7 @@ __version__ = "1.0.0rc1"
 def code_identity(part: str = "") -> str:
     """Return the SHA-256 of the source of a subpackage, by default of the whole package.
 
-    Code that only shows results or parses arguments changes no number and is left out.
+    Code that only shows results or parses arguments is left out, because it changes no number.
 
     Args:
         part: path of the subpackage inside the package, like "contact/lattice".

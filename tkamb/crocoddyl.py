@@ -356,7 +356,7 @@ class _CondyleResidual(crocoddyl.ResidualModelAbstract):
 
 
 class CondyleForces(_CondyleResidual):
-    """Residual: the contact forces of the medial and the lateral condyle, N, shape (2,).
+    """Residual: the contact forces of the medial and the lateral condyle, N, (2,).
 
     The contact model needs an exact tangent, as foundation and lattices have. The arguments are
     those of `CondylePressures`.
@@ -378,7 +378,7 @@ class CondyleForces(_CondyleResidual):
 
 
 class CondylePressures(_CondyleResidual):
-    """Residual: smooth peak pressures of the medial and the lateral condyle, Pa, shape (2,).
+    """Residual: smooth peak pressures of the medial and the lateral condyle, Pa, (2,).
 
     `tkamb.knee.smooth_peak` has the equation.
 

@@ -47,12 +47,12 @@ BYTE_ORDER_MARKS = {
     codecs.BOM_UTF16_LE: "utf-16",
     codecs.BOM_UTF16_BE: "utf-16",
 }
-"""First bytes of a text file, which editors of Windows write -> its encoding."""
+"""First bytes of a text file -> its encoding. Editors of Windows write them."""
 
 SAVE_AS_UTF8 = "save it as UTF-8 text"
 
 HASH_LIMIT = 100_000 * MEGABYTE
-"""bytes: largest file for a SHA-256, which takes five minutes."""
+"""bytes: largest file for a SHA-256. Reading it takes five minutes."""
 
 
 def open_regular(path: str | Path, limit: float, *, what: str = "file", follow: bool = True) -> int:
@@ -60,6 +60,7 @@ def open_regular(path: str | Path, limit: float, *, what: str = "file", follow: 
 
     Args:
         what: kind of file, for messages.
+        follow: whether the path may be a symbolic link.
 
     Raises:
         InputError: the file does not exist, is not regular, is too large or cannot be opened.
@@ -82,7 +83,7 @@ def open_regular(path: str | Path, limit: float, *, what: str = "file", follow: 
 
 
 def check_readable(status: os.stat_result, path: str | Path, limit: float) -> None:
-    """Raise unless a status is that of a regular file of at most `limit` bytes.
+    """Raise unless a file's status is that of a regular file of at most `limit` bytes.
 
     Raises:
         InputError: the path is a folder, FIFO, device or socket, or the file is too large.
@@ -248,6 +249,9 @@ def check_file(path: str | Path, limit: float, *, what: str = "file") -> None:
 def sha256_of(path: str | Path, limit: float = HASH_LIMIT) -> str:
     """Return the SHA-256 of a regular file's content, hexadecimal.
 
+    Args:
+        limit: largest size, bytes.
+
     Raises:
         InputError: the file does not exist, is too large or cannot be read.
     """
@@ -292,8 +296,8 @@ OUTPUT_NAMES = frozenset(
 """Files that are replaced together; a journal can rename and remove no others."""
 TEMPORARY = re.compile(r"\.tkamb-[0-9a-f]{12}\.part")
 LONGEST_WAIT = 2.0
-"""s: time that a reader waits for a writer to rename its finished files, which takes milliseconds.
-"""
+"""s: time that a reader waits until a writer has moved its finished files into place, which takes
+milliseconds."""
 
 
 def temporary_path(folder: Path) -> Path:
@@ -303,7 +307,7 @@ def temporary_path(folder: Path) -> Path:
 
 @contextmanager
 def replaced_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary path in the same folder, whose file replaces `path` at the end.
+    """Yield a temporary path in the same folder. At the end its file replaces `path`.
 
     When the block raises, `path` stays unchanged.
 
@@ -444,8 +448,9 @@ def check_replaced(folder: Path) -> None:
 
 
 def finish_replacement(folder: Path) -> None:
-    """Rename the files that a folder's journal lists, if there is one. The call can be repeated,
-    but only by the process that has claimed the folder.
+    """Rename the files that a folder's journal lists. Without a journal, do nothing.
+
+    The call can be repeated, but only by the process that has claimed the folder.
 
     Raises:
         InputError: the journal is damaged, or the folder cannot be written.

@@ -32,7 +32,7 @@ STIFFNESS_TOLERANCE = 0.1
 
 
 class ConformanceError(TkambError):
-    """A contact model lacks the property of the contract that the message names."""
+    """A contact model lacks a property of the contract. The message names the property."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +67,7 @@ def check_contact_model(
         model: the contact model.
         pair: the two bodies; default: `two_sphere_pair`.
         pose: (4, 4) pose_femoral_in_insert; default: 10 deg of flexion, 0.2 deg of varus.
+        load: N, compressive.
         tolerance: 1, relative tolerance of forces, approach and pressure between equivalent
             evaluations.
 

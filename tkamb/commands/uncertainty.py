@@ -22,7 +22,7 @@ TERMS = 2
 variance of n samples.
 """
 NOTABLE_FAILED = 0.05
-"""1: share of failed samples in a frame above which there is a warning."""
+"""1: share of failed samples in a frame. A larger share gives a warning."""
 
 
 def add_uncertainty(commands: Any) -> None:

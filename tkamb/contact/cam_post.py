@@ -63,7 +63,7 @@ class PostPair(ContactPair):
     def clearance(self, pose: Array) -> float:
         """Return the smallest gap (m) along y' of post and cam; NaN if no line along y' meets both.
 
-        Rays along y' on a grid over the post find it, then on two finer grids. A search over
+        Rays along y' on a grid over the post find it; two finer grids follow. A search over
         vertices would miss contact on the edges of long triangles. `pose` (4, 4) is
         pose_femoral_in_turned.
         """
@@ -84,7 +84,7 @@ class PostPair(ContactPair):
         return least
 
     def _apart(self, points: Array, pose: Array) -> Array:
-        """Return the gap (n,), m, along y' at (n, 3); NaN where a ray misses a body."""
+        """Return the gap (n,), m, along y' at places (n, 3); NaN where a ray misses a body."""
         far, back = float(np.abs(self.femoral.bounds).max()), inverse(pose)
         below = points + (pose[1, 3] - 2 * far) * UP
         up, _ = self.femoral.rays.first(transform(back, below), rotate(back, UP))
@@ -96,7 +96,7 @@ class PostPair(ContactPair):
 
 @dataclass(frozen=True, eq=False)
 class PostContact:
-    """Contact of cam and post at one pose, insert frame, SI; without contact the force is zero.
+    """Contact of cam and post at one pose, insert frame, SI. Without contact the force is zero.
 
     Args:
         load: wrench of the normal forces on the insert; None without contact.
@@ -264,7 +264,10 @@ def _together(condyles: ProbedContact, post: ProbedContact) -> ProbedContact:
 
 
 def twist_matrix(pose: Array) -> Array:
-    """Return X (6, 6), which transforms a twist from frame A to B, by pose_A_in_B (4, 4)."""
+    """Return X (6, 6), which transforms a twist (translation, then rotation) from frame A to B.
+
+    `pose` is pose_A_in_B (4, 4).
+    """
     turn, (x, y, z) = pose[:3, :3], pose[:3, 3]
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     return np.block([[turn, cross @ turn], [np.zeros((3, 3)), turn]])

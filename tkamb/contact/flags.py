@@ -34,8 +34,8 @@ def narrow_flags(
 ) -> Iterator[str]:
     """Yield a flag for each condyle with too few inner points (see `surrounded`).
 
-    `triangles` (k, 3) join the points, `sides` (n,) are those under each condyle, and `points` is
-    their word in the message.
+    `triangles` (k, 3) join the points; `sides` (n,) are those under each condyle; `points` is the
+    word for them in the message.
     """
     inner = surrounded(triangles, touched)
     for side, under_side in sides.items():

@@ -208,7 +208,7 @@ class _NearColumns:
         self.within, self.beyond, self._last = -np.inf, np.inf, 0.0
 
     def reaction(self, approach: float) -> float:
-        """Return the reaction (N) at an approach (m); inf where it is out of range.
+        """Return the reaction (N) at an approach (m); inf where the approach is out of range.
 
         If `within` and `beyond` differ by at most `APPROACH_STEP`, it is that at `within` between
         them.
@@ -355,7 +355,7 @@ class FoundationProbe:
         return replace(contact, condyles=condyles)
 
     def loaded_points(self, pose: Array, contact: ProbedContact, slopes: bool) -> LoadedPoints:
-        """Return the pressures of the loaded columns; with `slopes` their derivatives, too.
+        """Return the pressures of the loaded columns; with `slopes` their derivative, too.
 
         A displacement changes the gap of a column by M . xi/c, and so its pressure p(d/h) by -p' M
         . xi/(c h).
@@ -415,6 +415,8 @@ def _add_up(
     """Sum the columns' forces, and their change as the femoral component moves.
 
     Args:
+        chosen: (m,) numbers of the columns.
+        area: (n,) m².
         gradients: (m, 3) normals of the femoral surface where the columns meet it, of any length.
         curvatures: (k, 3, 3) 1/m, of the patches: minus the derivative of `gradients` by the place
             on the femur, femoral frame.

@@ -73,6 +73,8 @@ def contact_ellipse(
 
 
 def _axis_ratio(curvature_ratio: float) -> float:
+    """Return k = b/a for B/A >= 1."""
+
     def excess(log_ratio: float) -> float:
         square = np.exp(2 * log_ratio)
         ratio = elliprd(0.0, 1.0, square) / elliprd(0.0, square, 1.0)

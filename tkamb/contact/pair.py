@@ -78,8 +78,8 @@ class ContactPair:
     def touch_at(self, pose: Array) -> Touch | None:
         """Return the first touch of either condyle; its travel starts at y = 0.
 
-        y of the pose has no influence, and the last eight results are cached. None if the femoral
-        component does not lie over the insert or the pose is not finite.
+        y of the pose has no influence. None if the femoral component does not lie over the insert
+        or the pose is not finite. The last eight results are cached.
         """
         level = np.array(pose, float)
         if not np.isfinite(level).all():

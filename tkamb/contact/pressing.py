@@ -25,9 +25,8 @@ class PressSettings:
     load_tolerance: float = 1e-6
     """1: relative difference of reaction and load below which the search has converged."""
     coarse_tolerance: float = 1e-3
-    """1: relative difference above which the press has not converged: more than `load_tolerance`,
-    because a reaction may jump where map points come into contact.
-    """
+    """1: relative difference above which the press has not converged. It exceeds `load_tolerance`,
+    because a reaction may jump where map points come into contact."""
     first_approach: float = 5e-5
     """m: initial guess of the approach if the caller gives none."""
     max_approach: float = 0.02
@@ -36,13 +35,11 @@ class PressSettings:
     """m: width of the bracket at which the search ends. It is above the rounding of
     an approach of 20 mm (3e-18 m)."""
     max_evaluations: int = 80
-    """Most evaluations of the reaction in one press; bisection of `max_approach` to `least_bracket`
-    needs 48.
-    """
+    """Largest number of evaluations of the reaction in one press. Bisection of `max_approach` to
+    `least_bracket` needs 48."""
     flagged_thickness_share: float = 0.5
-    """1: ratio of approach to thickness from which a result is flagged. The contact has failed at
-    twice this ratio.
-    """
+    """1: ratio of approach to thickness from which a result is flagged. Half of the ratio
+    at which the contact has failed."""
     rim_distance: float = 0.5 * MILLIMETRE
     """m: near the rim the thickness, zero at the rim itself, is the largest one within this
     distance.
@@ -128,7 +125,7 @@ def press_by_search(
 
 
 def beside_words(pair: ContactPair, pose: Array) -> str:
-    """Return the distance of the bounding boxes, in words, of a component beside the insert."""
+    """Return words for a component beside the insert, with the distance of the bounding boxes."""
     femur = transform(pose, pair.femoral.vertices)[:, [0, 2]]
     insert = pair.insert.vertices[:, [0, 2]]
     apart = np.maximum(insert.min(0) - femur.max(0), femur.min(0) - insert.max(0))
@@ -243,8 +240,8 @@ def unloaded_result(model: "ContactModel", state: Any, pose: Array) -> ContactRe
 def within_insert(state: Any, result: ContactResult, *more: str) -> ContactResult:
     """Return the result, after a check that the bodies are not pressed through each other.
 
-    At an approach of the insert's thickness (`compression`) it is OUT_OF_RANGE, and flagged from
-    `PRESS.flagged_thickness_share` of it.
+    It is OUT_OF_RANGE if the approach is at least the insert's thickness (`compression`), and
+    flagged from `PRESS.flagged_thickness_share` of it. `more` are other flags.
     """
     touch = state.pair.touch_at(result.pose)
     if touch is not None and result.approach > 0:
@@ -283,7 +280,7 @@ def compression(pair: ContactPair, touch: Touch, result: ContactResult) -> tuple
 def thickness_near(pair: ContactPair, positions: Array) -> Array:
     """Return the insert's thickness (n,), m, along y at positions (n, 3).
 
-    A vertical ray measures it from the top to where it first leaves the insert. Near a rim it is
+    A ray from the top measures it to the point where it first leaves the insert. Near a rim it is
     the largest within `PRESS.rim_distance`; without a ray that meets the insert, the height above
     the bottom.
     """

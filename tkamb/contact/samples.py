@@ -326,7 +326,7 @@ def _depth(caster: RayCaster, points: Array, normals: Array, thickness: Array) -
 
 
 def _grid_triangles(cell: Index, shape: tuple[int, int]) -> Index:
-    """Return triangles (k, 3) between neighbouring points, facing +y."""
+    """Return the triangles (k, 3) between neighbouring points, facing +y."""
     number = np.full(shape, -1)
     number.ravel()[cell] = np.arange(len(cell))
     a, b = number[:-1, :-1].ravel(), number[:-1, 1:].ravel()
@@ -373,7 +373,7 @@ class Neighbourhood:
         self._last_position[:] = transform(inverse(pose), self._bed.points)
 
     def at(self, pose: Array) -> tuple[Index, Meeting]:
-        """Return the near columns, and where they meet the femoral surface."""
+        """Return the near columns at a pose (4, 4), and where they meet the femoral surface."""
         steep = MAP_POINT.side_start_normal_y
         near, gap, gradient, patch = meet_nearby(*self.inputs, pose, steep)
         return near, Meeting(gap, gradient, patch)
@@ -385,7 +385,7 @@ def meet_nearby(
 ) -> tuple[Index, Array, Array, Index]:
     """Return the columns (m,) that the femoral component may reach, and the fields of `Meeting`.
 
-    `memory`, of all columns, is updated; `steep`: see `meet_columns`.
+    `memory`, of all columns, is updated. `steep`: see `meet_columns`.
     """
     points, (last_gap, last_position, places) = columns[0], memory
     near, number, place = np.empty(len(points), np.int64), 0, np.empty(3)
@@ -417,5 +417,4 @@ def meet_nearby(
 DOWN = np.array([0.0, -1.0, 0.0])
 DEEPEST = 0.5
 """1: largest penetration that can be measured, as a share of the thickness. Rays towards the femur
-start there.
-"""
+start at this depth."""

@@ -130,7 +130,7 @@ def _limited_turn(
     distance: float,
     settings: AdjustmentSettings,
 ) -> tuple[float, tuple[str, ...]]:
-    """Return the turn (rad), 0 beyond the limit, and a flag close to it."""
+    """Return the turn (rad), 0 beyond the limit, and a flag close to the limit."""
     limit, margin = settings.largest_angle, settings.input_change / distance
     if abs(angle) > limit + margin:
         return 0.0, ()
@@ -182,7 +182,7 @@ def _check_near(gaps: CondyleGaps, settings: AdjustmentSettings) -> None:
 
 
 def _coronal_angle(gaps: CondyleGaps) -> tuple[float, float]:
-    """Return coronal angle (rad) and intercondylar distance (m); 0 and NaN for one condyle."""
+    """Return coronal angle (rad) and intercondylar distance (m); zero and NaN for one condyle."""
     if gaps.lateral is None:
         return 0.0, math.nan
     separation = gaps.lateral.point_on_femoral - gaps.medial.point_on_femoral
@@ -193,7 +193,7 @@ def _coronal_angle(gaps: CondyleGaps) -> tuple[float, float]:
 def _levelling_turn(
     query: ClosestPointQuery, recorded: Array, distance: float, settings: AdjustmentSettings
 ) -> float:
-    """Return the turn (rad) at which both touch together, by the secant method."""
+    """Return the turn (rad) at which both condyles touch together, by the secant method."""
 
     def difference(turn: float) -> float:
         medial, lateral = touches(query, _turned(query, recorded, turn))

@@ -45,7 +45,7 @@ class HeightBound:
         self._cells = self._cell_planes(surface)
 
     def over(self, points: Array) -> Array:
-        """Return a height (n,), m, that the surface over points (n, 3) does not exceed."""
+        """Return a height (n,), m, that the surface over the points (n, 3) does not exceed."""
         xz = points[:, [0, 2]]
         plane = self._cells[tuple(self._place(xz).T)]
         return np.einsum("ij,ij->i", plane[:, :2], xz) + plane[:, 2]
@@ -96,9 +96,8 @@ class ClosestPointSettings:
     """The search for the closest points of two surfaces."""
 
     region_radius: float = 1.6e-2
-    """m: largest distance of a point of the close region from the closest point. A condyle's
-    contact is smaller.
-    """
+    """m: largest distance of a point of the close region from the closest point. A
+    condyle's contact is smaller."""
     facing_cosine: float = 0.7
     """1: cosine of the angle between the surfaces above which they face each other.
     Surfaces at more than 45 deg do not touch face to face."""
@@ -384,7 +383,7 @@ def _within_box(points: Array, pose: Array, low: Array, high: Array) -> tuple[In
 
 @compiled_as_written
 def _facing_alike(samples: Array, normals: Array, place: Array, radius: float) -> Index:
-    """Return the samples within `radius` (m) with normals within 60 deg of the nearest's."""
+    """Return the samples within `radius` (m) whose normals are within 60 deg of the nearest's."""
     square, nearest = np.empty(len(samples)), 0
     for i in range(len(samples)):
         x, y, z = samples[i, 0] - place[0], samples[i, 1] - place[1], samples[i, 2] - place[2]

@@ -24,14 +24,14 @@ class CondyleSettings:
     single condyle of a real component has notches up to 2.4 mm (components of the Grand Challenge
     subjects DM and JW, and of the shipped knee, cut in halves)."""
     extended_notch_depth: float = 0.5e-3
-    """m: smallest depth, at 0 deg of flexion, of the notch between two condyles. A single long body
-    has none there, although its ends may resemble condyles in flexion.
-    """
+    """m: smallest depth, at 0 deg of flexion, of the notch between two condyles. A
+    single long body has no notch there, although its ends may resemble condyles in flexion."""
     facet_depth: float = 3e-5
     """m: largest distance between a facet of 1 to 2 mm and the curved condyle that it approximates.
     Heights that differ by less count as equal."""
     strip_width: float = 1e-3
-    """m: width of the strips along z in which the notch is searched; a condyle is wider."""
+    """m: width of the strips along z in which the notch is searched. A condyle is
+    wider."""
     sample_spacing: float = 1e-3
     """m: spacing of the samples of a condyle's surface. About the size of a mesh's
     facets."""
@@ -156,6 +156,7 @@ def condyle_yaw(femoral: Surface, search: YawSearch = YAW_SEARCH) -> tuple[float
 
 
 def _check_yaw(femoral: Surface) -> None:
+    """Raise an InputError if the two condyles do not lie side by side along z."""
     yaw, notch = condyle_yaw(femoral)
     if notch < CONDYLE.yawed_notch_depth or abs(yaw) <= YAW_SEARCH.largest_yaw:
         return
@@ -236,7 +237,7 @@ def orientation(femoral: Surface, pose: Array) -> Orientation | None:
 def condyle_faces(femoral: Surface, split: float | None) -> tuple[Index, Index]:
     """Return the triangles (k,) of the medial and of the lateral condyle.
 
-    A triangle's centroid decides its side; without a split all are medial.
+    A triangle's centroid decides its side. Without a split all triangles are medial.
     """
     if split is None:
         return np.arange(len(femoral.faces)), np.empty(0, np.int64)
@@ -251,7 +252,7 @@ def _samples(femoral: Surface, spacing: float) -> Array:
 
 
 def _mean_outline(samples: Array, width: float, flexions: Array) -> tuple[Array, Array]:
-    """Return the outline's height (n,), m, above its lowest point, and z (n,), m, of strips."""
+    """Return height (n,), m, of the outline above its lowest point, and z (n,), m, of strips."""
     low, high = samples[:, 2].min(), samples[:, 2].max()
     count = max(int(np.ceil((high - low) / width)), 3)
     strip = np.clip(((samples[:, 2] - low) / (high - low) * count).astype(int), 0, count - 1)
@@ -278,9 +279,9 @@ def _rise(outline: Array) -> Array:
 class LowestPoints:
     """Lowest point of each condyle along the insert's y, prepared for many poses.
 
-    The point has the y of the lowest vertex. For a smooth movement its x and z are means over the
-    condyle's surface. The weight is exp(-height / `CONDYLE.facet_depth`), with the height above the
-    lowest vertex. `split` is z (m, femoral frame) between the condyles; None for one.
+    The point has the y of the lowest vertex. Its x and z are means over the condyle's surface with
+    the weight exp(-height / `CONDYLE.facet_depth`), height above the lowest vertex. The point
+    therefore moves smoothly. `split` is z (m, femoral frame) between the condyles; None for one.
     """
 
     def __init__(self, femoral: Surface, split: float | None) -> None:

@@ -49,7 +49,7 @@ class CurvedSurface:
 
     @classmethod
     def of(cls, surface: "Surface") -> "CurvedSurface":
-        """Return the patches of a surface by its corner normals."""
+        """Return the patches of a surface from its corner normals."""
         finer = coarsened(surface.vertices, surface.faces)
         if finer is not None:
             surface = surface.remade(surface.vertices, finer.faces)

@@ -158,7 +158,7 @@ def _opening(surface: "Surface", loop: BoundaryLoop) -> Defect:
 
 
 def _inward(surface: "Surface", loop: BoundaryLoop) -> float:
-    """Return the mean cosine between the surface beside a loop and the way to its centre."""
+    """Return the mean cosine between the surface beside a loop and the way to the loop's centre."""
     on_loop = np.isin(surface.corner_vertices, loop.vertices)
     beside = on_loop.sum(axis=1) == 2
     corners = surface.vertices[surface.corner_vertices[beside]]

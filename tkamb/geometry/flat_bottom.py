@@ -210,7 +210,7 @@ def _largest_flat(
 
 
 def _peaks(normals: Array, area: Array) -> list[Array]:
-    """Return the directions (3,) that most area faces: at most 8, 15 deg apart or more."""
+    """Return the directions (3,) that the most area faces: at most 8, at least 15 deg apart."""
     # Each cell of the unit sphere has one number, because `np.unique` is slower on rows.
     number = np.round(normals * 6.0).astype(np.int64) @ [400, 20, 1]
     cells, cell = np.unique(number, return_inverse=True)

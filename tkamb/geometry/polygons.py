@@ -91,7 +91,7 @@ def _outline(
 
 
 def _points_below(segments: Array, y: float) -> Array:
-    """Return ends (n, 2) of the parts of segments (k, 2, 2) below y (m)."""
+    """Return the ends (n, 2) of the parts of segments (k, 2, 2) below y (m)."""
     if np.isfinite(y):
         low, high = np.sort(segments[:, :, 1], axis=1).T
         a, b = segments[(low < y) & (high > y)].transpose(1, 0, 2)
@@ -118,8 +118,8 @@ class CrossedPolygonError(ValueError):
 def triangulated(vertices: Array, corners: Index, ends: Index) -> Index:
     """Return polygons as triangles (k, 3) with the winding of the polygons.
 
-    A convex polygon becomes a fan about its first corner. From a concave one ears are cut off one
-    by one (Meisters, Am Math Monthly 82:648, 1975). Those with fewer than three corners are
+    A convex polygon becomes a fan about its first corner. From a concave polygon ears are cut off
+    one by one (Meisters, Am Math Monthly 82:648, 1975). Polygons with fewer than three corners are
     skipped.
 
     Args:

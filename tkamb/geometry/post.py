@@ -152,7 +152,7 @@ def _ground(top: Array, patch: Mask, dish: float) -> float:
 
 
 def _steep_share(top: Array, patch: Mask) -> float:
-    """Return the share of lines around a patch that end at least `side_drop` below its edge."""
+    """Return the share of the lines around a patch that end at least `side_drop` below the edge."""
     near = binary_dilation(patch)
     around = binary_dilation(near, iterations=1) & ~near
     edge = float(np.median(top[patch & binary_dilation(~patch)]))

@@ -288,10 +288,9 @@ def ray_work() -> tuple[Array, Array, Index, Array]:
 def _first_crossings(
     tree: tuple[Array, Index, Array, float], origins: Array, directions: Array
 ) -> tuple[Array, Index, Array]:
-    """Return each ray's first crossing: distance (n,), m, triangle (n,) and barycentrics (n, 3);
-    inf, -1 and NaN for none.
+    """Return distance (n,), m, triangle (n,) and barycentrics (n, 3) of each ray's first crossing.
 
-    `directions` are (n, 3) of any length, or (1, 3) for all rays.
+    inf, -1 and NaN without a crossing. `directions` (n, 3) of any length, or (1, 3) for all rays.
     """
     count, (_, faces, planes, _) = len(origins), tree
     distance, face = np.full(count, np.inf), np.full(count, NO_TRIANGLE)

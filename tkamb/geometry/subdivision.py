@@ -111,7 +111,7 @@ class _Search:
         return np.zeros(0, np.int64)
 
     def _spread(self, start: Index) -> Index | None:
-        """Return the middles that follow from a first one; None if they contradict."""
+        """Return the middle triangles that follow from a first one; None if they contradict."""
         kind = np.zeros(len(self._faces), np.int8)  # 1: middle triangle, 2: triangle at a tip
         is_tip = np.zeros(len(self._points), bool)
         new, layers = start, []

@@ -295,7 +295,7 @@ class Surface:
         return remade
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return fields and defects; the rest is larger and computed again."""
+        """Return the fields and the defects; others are larger and computed again."""
         state = {field.name: getattr(self, field.name) for field in fields(self)}
         known = {} if "defects" not in self.__dict__ else {"defects": self.defects}
         return state | known
@@ -305,7 +305,7 @@ def corner_normals(surface: Surface, crease: float, weights: Array) -> Array:
     """Return unit normals (k, 3, 3), one per triangle and corner.
 
     It is the weighted mean over triangles at the vertex whose normals differ by at most `crease`,
-    so that a sharp edge does not tilt the normals beside it. Vertices at one place count as one; a
+    so that a sharp edge does not tilt the normals beside it. Vertices at one place count as one. A
     triangle without area has zero normals.
 
     Args:
@@ -333,7 +333,7 @@ def corner_normals(surface: Surface, crease: float, weights: Array) -> Array:
 
 
 def corner_angles(surface: Surface) -> Array:
-    """Return angles (k, 3), rad, of triangles at their corners."""
+    """Return the angles (k, 3), rad, of triangles at their corners."""
     corners = surface.triangles
     ahead = np.roll(corners, -1, axis=1) - corners
     behind = np.roll(corners, 1, axis=1) - corners
@@ -354,7 +354,7 @@ def sharp_edges(surface: Surface, sharp: float = SHARP_EDGE) -> Mask:
 
 
 def _sums(index: Index, rows: Array, count: int = 0) -> Array:
-    """Return the sum (n,) of the rows (m, n) of each index (m,); at least `count`."""
+    """Return the sum (n,) of the rows (m, n) of each index (m,); at least `count` sums."""
     return np.stack([np.bincount(index, column, count) for column in rows.T], axis=1)
 
 

@@ -50,9 +50,9 @@ def is_closed(faces: Index) -> bool:
 
 
 def same_places(points: Array) -> tuple[Index, Index]:
-    """Return the first point (g,) of each group of equal ones, and every point's group (n,).
+    """Return the first point of each group of equal points (g,), and the group (n,) of every point.
 
-    Groups are by a hash of the bits, or sorted if it is not unique.
+    Points (n, 3) are grouped by a hash of their bits, or sorted if it is not unique.
     """
     bits = np.ascontiguousarray(points + 0.0).view(np.uint64)  # -0 becomes 0
     mixed = bits * _ODD

@@ -28,11 +28,11 @@ class TomlLimits:
     size: int = 8 * MEGABYTE
     """bytes: largest file, for which Python's reader takes ten seconds."""
     key_parts: int = 16
-    """Largest number of parts of a dotted key or a table's name; a scene needs four."""
+    """Largest number of parts of a dotted key or of a table's name. A scene needs four."""
     digits: int = 100
     """Largest number of successive digits in a number."""
     depth: int = 32
-    """Largest depth of nested lists and inline tables; a scene needs four."""
+    """Largest depth of nested lists and inline tables. A scene needs four."""
 
 
 LIMITS = TomlLimits()

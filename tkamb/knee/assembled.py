@@ -77,14 +77,14 @@ PATELLAR_LIGAMENT = "patellar_ligament"
 class KneeData:
     """Data that a caller passes from call to call to save time; `Knee.create_data` makes it.
 
-    Results change at most within the solver's tolerance; None: not computed yet, or not modelled.
+    Results change at most within the solver's tolerance.
 
     Args:
         data: Pinocchio data of the user's model.
         probe: probe of the contact model, with the last contact as warm start; None: no contact
             model.
         patella: state of the patella from the last call; None: not computed yet.
-        seen: bytes of the last pose, and the contact there.
+        seen: bytes of the last pose, and the contact at that pose; None: not computed yet.
         start: warm start of the next press, from the last press or evaluation; None: there was
             none.
         button_start: warm start of the next press of the button; None: there was none.
@@ -316,6 +316,7 @@ class AssembledKnee:
 
         Args:
             patella: the patella at this pose; None: not modelled.
+            tensions: muscle -> tension, N.
         """
         poses, total = self._link_poses(kinematics, patella), list[PointForces]()
         if self._plane_lines:
@@ -450,7 +451,7 @@ class AssembledKnee:
 
     @property
     def _finds_patella(self) -> bool:
-        """True if the model has no patella, so that equilibrium gives its pose."""
+        """Whether equilibrium determines the patella's pose, because the model has no patella."""
         return self.anatomy.patella is None
 
     @property
@@ -502,7 +503,7 @@ class AssembledKnee:
         return poses
 
     def _with_lines(self, data: KneeData, tensions: Mapping[str, float], forces: Any) -> Any:
-        """Return forces on the joints with those of the muscle lines added.
+        """Return forces on the joints with the forces of the muscle lines added.
 
         Args:
             data: data with joint placements up to date.

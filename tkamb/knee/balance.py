@@ -40,9 +40,8 @@ class BalanceSettings:
     step_tolerance: float = 2e-6
     """m: Newton step below which a coordinate has converged. Not studied."""
     least_stiffness: float = 100.0
-    """N/m: a state with a smaller stiffness is indeterminate: it moves by more than 10 mm per
-    newton.
-    """
+    """N/m: a state with a smaller stiffness is indeterminate. Such a state moves by
+    more than 10 mm per newton."""
     narrow_radius: float = 1e-6
     """m: trust radius below which finite differences replace an approximate stiffness.
     An approximation that needs shorter steps does not reduce the residual."""
@@ -56,15 +55,14 @@ class BalanceSettings:
     to 0.6 N, where a column crosses an edge of two femoral facets.
     """
     max_travel: float = 20e-3
-    """m: largest distance of a coordinate from its initial guess, at which the search ends. A
-    coordinate that moves as far has no stable equilibrium.
-    """
+    """m: largest distance of a coordinate from its initial guess; beyond it the search ends.
+    A coordinate that moves as far has no stable equilibrium."""
     difference_step: float = 2e-6
     """m: step of the finite differences of the force. Equal to `step_tolerance`."""
     max_prediction_error: float = 0.5
-    """1: relative error of the predicted change of force that discards all corrections of an
-    approximate stiffness. With a larger error a step does not reduce the residual reliably.
-    """
+    """1: relative error of the predicted change of force. A larger error discards all corrections
+    of an approximate stiffness. With a larger error a step does not reduce the
+    residual reliably."""
     max_steps: int = 200
     """Maximum number of steps. A lightly loaded knee that slides 16 mm over lattice
     cells of 2 mm needs 80."""
@@ -282,7 +280,7 @@ class _Search:
                 )
 
     def _next(self) -> tuple[Array, float]:
-        """Return the next step, and its share of Newton's step; 0: it is no such step."""
+        """Return the next step, and its share of Newton's step; 0: it is no Newton step."""
         symmetric, smallest_stiffness = smallest_eigenvalues(self.stiffness)
         if symmetric > 0 or smallest_stiffness <= 0 or self._newton_rejected:
             return bounded_step(self.stiffness, self.force, self._radius), 0.0
@@ -318,7 +316,7 @@ class _Search:
 
         If both ends have an approximate stiffness, the update corrects their mean. If the change of
         force differs too much from its prediction (contact was made or lost), all updates are
-        discarded, unless new finite differences gave the stiffness.
+        discarded, unless the stiffness comes from new finite differences.
         """
         expected = self.stiffness @ step
         if self._model_stiffness is not None and trial.stiffness is not None:
@@ -462,7 +460,7 @@ def bounded_step(stiffness: Array, force: Array, radius: float) -> Array:
 def smallest_eigenvalues(stiffness: Array) -> tuple[float, float]:
     """Return the smallest eigenvalue of the symmetric part, and the smallest real part.
 
-    Follower loads make a stiffness unsymmetric; the state is stable against divergence if the
+    Follower loads make a stiffness unsymmetric. A state is then stable against divergence if the
     second value is positive.
     """
     return _smallest_eigenvalues(stiffness.tobytes(), len(stiffness))

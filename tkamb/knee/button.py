@@ -93,7 +93,7 @@ class ButtonPress:
 
     @property
     def facets(self) -> dict[str, CondyleContact | None]:
-        """Side -> contact of that facet, None if it is unloaded; empty without contact."""
+        """Side -> contact of that facet; None: the facet is unloaded. Empty without contact."""
         if self.contact is None:
             return {}
         return {"medial": self.contact.medial, "lateral": self.contact.lateral}
@@ -113,7 +113,7 @@ class ButtonPress:
 
     @property
     def centre(self) -> Array:
-        """Centre of pressure of both facets, insert frame, shape (3,), m; NaN without contact."""
+        """Centre of pressure of both facets, insert frame, (3,), m; NaN without contact."""
         facets = [facet for facet in self.facets.values() if facet is not None]
         if not facets:
             return np.full(3, np.nan)

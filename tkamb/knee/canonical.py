@@ -233,7 +233,7 @@ class Bridge:
     def twist(self, data: Any) -> Array:
         """Return the femur's twist (6,) relative to the insert, at the insert's origin and axes.
 
-        `data` needs velocities up to date.
+        `data` has velocities up to date.
         """
         total, joint = np.zeros(6), self.component.joint
         if joint:
@@ -285,7 +285,7 @@ class Bridge:
         """Return coordinates, rates and accelerations (3, n) between two bodies.
 
         q is that of the chain with its root at the neutral pose; `base` is on the parent body,
-        `follower` on the child. `rows` are these coordinates in the chain's joint coordinates.
+        `follower` on the child; `rows` are these coordinates in the chain's joint coordinates.
         """
         twist, rate = self._relative(data, base, follower)
         model, cache = self.chain.model, self._chain_data
@@ -425,14 +425,14 @@ class Bridge:
         return pin.StdVec_Force(forces)
 
     def joint_of(self, link: str) -> int:
-        """Return the user's joint of a link; a missing patella is part of the femur."""
+        """Return the user's joint that carries a link; a missing patella is part of the femur."""
         patella = self.anatomy.patella
         if link == "patella" and patella is not None:
             return patella.joint
         return self.insert.joint if link == "tibia" else self.component.joint
 
     def to_joint(self, data: Any, link: str) -> Array:
-        """Return the (6, 6) map of a force from the insert frame to a link's joint."""
+        """Return the matrix (6, 6) that maps a force from the insert frame to a link's joint."""
         insert = data.oMi[self.insert.joint] * self.insert.placement
         return np.asarray(data.oMi[self.joint_of(link)].actInv(insert).toDualActionMatrix())
 

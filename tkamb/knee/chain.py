@@ -73,8 +73,8 @@ class Chain:
         Args:
             mass_factor: factor on the mass and inertia of every segment.
             insert_shift: displacement of insert and femur, insert axes, (3,), m.
-            insert_turn: rotation of insert and femur about the insert's origin, insert axes, (3,
-                3); None: no rotation.
+            insert_turn: rotation of insert and femur about the insert's origin, insert axes, shape
+                (3, 3); None: no rotation.
         """
         other, model = copy.copy(self), pin.Model(self.model)
         for joint in range(1, model.njoints):
@@ -194,7 +194,7 @@ class Chain:
 
 
 class ChainState:
-    """The chain at one instant; poses and loads are in the insert frame.
+    """The chain at one instant. Poses and loads are in the insert frame.
 
     Attributes:
         inertial: RNEA(q, v, a), (nv,): generalised forces that all loads must add up to.

@@ -77,11 +77,11 @@ class KneeContact:
         return KneeContact(self.model, self.pair.of_material(stiffer), friction)
 
     def probe(self, start: Guess | None = None) -> Any:
-        """Return a new probe (`tkamb.contact.model.Probe`); the caller reuses it as warm start."""
+        """Return a new probe (`tkamb.contact.model.Probe`). The caller reuses it as warm start."""
         return self.model.probe(self.state, start)
 
     def precise_probe(self, start: Guess | None = None) -> Any:
-        """Return a probe that is precise enough for finite differences."""
+        """Return a new probe that is precise enough for finite differences."""
         names = {field.name for field in fields(self.model)}  # type: ignore[arg-type]
         if "tolerance" not in names:
             return self.probe(start)

@@ -63,8 +63,8 @@ class CrossingLines:
     def turned(self, state: "ChainState") -> float:
         """Return the rotation of the knee since the points were computed, rad; NaN: unknown.
 
-        The error of a line's direction is at most about this angle. The end of a line that wraps a
-        bone or passes a via point moves with the knee, but here it is fixed.
+        The end of a line that wraps a bone or passes a via point moves as the knee rotates, but
+        here it is fixed. The error of the direction is at most about this rotation.
         """
         if self.knee is None:
             return float("nan")
@@ -210,7 +210,7 @@ def yielding_flexion_row(
 
 
 def tension_by_ligament(geometry: KneeGeometry) -> tuple[float, float]:
-    """Return a (1) and b (N) of Q = a T + b, by the three equations of the patella.
+    """Return a (1) and b (N) of Q = a T + b from the three equations of the patella.
 
     A released patella has the ratio a of its equilibrium.
     """

@@ -355,22 +355,22 @@ def _patella_slopes(knee: "Knee", kinematics: KneePose, patella: "PatellaState")
 
 
 def _pose_differences(values: Callable[[Array], Array], pose: Array) -> Array:
-    """Return the derivative (n, 6) by a displacement of the femur."""
+    """Return the derivative (n, 6) of values (n,) by a displacement of the femur."""
     sizes = np.repeat([1.0, 1.0 / FORCE_DERIVATIVE_ARM], 3)
     return _edge_free(lambda move: values(displaced(pose, move)), sizes, POSE_STEP)
 
 
 def _patella_differences(values: Callable[[Array], Array], coordinates: Array) -> Array:
-    """Return the derivative (n, 3) by the patella's coordinates."""
+    """Return the derivative (n, 3) of values (n,) by the patella's coordinates."""
     sizes = np.array([1.0, 1.0, 1.0 / FORCE_DERIVATIVE_ARM])
     return _edge_free(lambda move: values(coordinates + move), sizes, PATELLA_STEP)
 
 
 def _edge_free(values: Callable[[Array], Array], sizes: Array, step: float) -> Array:
-    """Return the derivative (n, k) by k coordinates, by central differences.
+    """Return the derivative (n, k) of values (n,) by k coordinates, by central differences.
 
-    If the two one-sided differences differ by more than `EDGE`, an edge of a facet lies within the
-    step: a tenth of it is tried, then a hundredth.
+    If the two one-sided differences of a coordinate differ by more than `EDGE`, an edge of a facet
+    lies within the step: a tenth of the step is tried, then a hundredth.
     """
     here, columns = values(np.zeros(len(sizes))), []
     for k, size in enumerate(sizes):

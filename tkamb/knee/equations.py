@@ -180,7 +180,7 @@ def solved_unknowns(geometry: KneeGeometry, loads: SolvedLoads, friction: float)
 
 
 def unsolved(problems: Iterable[str]) -> SolvedLoads:
-    """Return the loads of a frame without a solution."""
+    """Return the loads of a frame without a solution: NaN, with the reasons."""
     nan = np.nan
     state = (frozenset[str](), False, False)
     return SolvedLoads({}, np.full(3, nan), nan, nan, nan, nan, *state, tuple(problems))
@@ -288,7 +288,7 @@ class KneeSystem:
         )
 
     def contact_force(self, values: Mapping[str, float]) -> Array:
-        """Return the force on the femur (3,), insert frame, without residuals."""
+        """Return the femorotibial force on the femur (3,), insert frame, without residuals."""
         if not self.geometry.condyles:
             return np.array([values[f"knee_force_{axis}"] for axis in unknowns.AXES])
         forces = [

@@ -79,7 +79,7 @@ class ExtensorLines:
         """Return the patella in equilibrium.
 
         `guess` is the patella at a similar pose, or else `near` its coordinates (3,), m and rad, as
-        initial guess. Without either, all rotations are searched.
+        initial guess. Without either the search covers all rotations.
         """
         if guess is None or not guess.status.found:
             return solve_patella(self.mechanism, pose, near)

@@ -69,8 +69,10 @@ class FrameStart:
     """Initial guess for the next frame; None: there is none.
 
     Args:
+        contact: warm start of the contact model; None: there is none.
         equilibrium: equilibrium of the released coordinates; None: none are released, or the frame
             failed.
+        button: warm start of the button's contact; None: there is none.
         patella: coordinates (6,) of the patella as a body.
     """
 
@@ -152,9 +154,9 @@ class Frame:
         return list(self.loads.problems) or ([self.problem] if self.problem else [])
 
     def area_above(self, side: str, pressure: float) -> float:
-        """Return the share of a condyle's contact area above a pressure (Pa), at most 1.
+        """Return the share of a condyle's contact area above a pressure (Pa), 1 at most.
 
-        See `tkamb.contact.area.area_above`.
+        The pressure is linear between the map points, see `tkamb.contact.area.area_above`.
         """
         condyle = getattr(self.contact, side, None)
         if self.contact is None or condyle is None:
@@ -323,7 +325,7 @@ class FrameMethod:
         return Frame(geometry, loads, end - query_end, query_end - began, adjustment, effect)
 
     def _adjust(self, pose: Array) -> "tuple[Adjustment | None, tuple[str, ...]]":
-        """Return the adjustment, if the method has one, and reasons for its failure."""
+        """Return the femoral adjustment, if the method has one, and reasons for its failure."""
         if self.knee.contact is None or self.adjust is None:
             return None, ()
         from tkamb.geometry.adjustment import adjust
@@ -495,7 +497,10 @@ class FrameMethod:
         return instant.resultants(instant.coordinates, condyles)
 
     def _post_contact(self, pose: Array) -> "PostContact | None":
-        """The result has a flag if cam and post overlap at a recorded AP position."""
+        """Return the contact of cam and post at a pose (4, 4); None: not modelled.
+
+        The result has a flag if cam and post overlap at a recorded AP position.
+        """
         if self.cam is None:
             return None
         post = self.cam.at(pose)

@@ -185,6 +185,7 @@ class Strings:
             `exit`.
         arc_m: lengths on the ellipsoid, m, (f,).
         length_m: whole lengths, m, (f,).
+        converged: mask of the taut strings, for which the iteration has converged, (f,).
     """
 
     entry: Array
@@ -277,7 +278,7 @@ def _taut(start: Array, end: Array, axes: Array, contour: Array, pieces: Array) 
 
 @dataclass(frozen=True, eq=False)
 class _Shot:
-    """Geodesics from the contour of `start`, which measure direction errors at `end`."""
+    """Geodesics from the contour of `start`, to measure their direction errors at `end`."""
 
     start: Array
     end: Array
@@ -346,8 +347,8 @@ def _follow_geodesics(
     Args:
         states: (x, v, j, j') at the starts, replaced by the values at the ends, (f, 8).
         pieces: lengths of the steps, m, (f, s).
-        weights: weights of the earlier stages in each of the k stages, (k, k). Those of the stages
-            in a step are `last_weights` (k,).
+        weights: weights of the earlier stages in each of the k stages, (k, k).
+        last_weights: weights of the stages in a step, (k,).
     """
     count = len(last_weights)
     stages, point, gradient = np.empty((count, 8)), np.empty(8), np.empty(3)

@@ -206,7 +206,7 @@ class Instant:
         return replace(geometry, extensor=extensor, muscles=(muscle,))
 
     def _pulls(self, state: "ChainState") -> tuple[dict[str, float], tuple[PointForces, ...]]:
-        """Return ligament -> tension (N), and the loads on the links."""
+        """Return ligament -> tension (N), and the ligaments' loads on the links."""
         if not self.ligaments:
             return {}, ()
         from tkamb.knee.ligaments import ligament_loads
@@ -257,6 +257,7 @@ class Instant:
         The rates are those of q and v.
 
         Args:
+            coordinates: knee coordinates, (6,), m and rad.
             point: position, insert frame, (3,), m.
         """
         velocity, spin = knee_twist(coordinates, self.motion.joints[1, :6])
@@ -265,9 +266,10 @@ class Instant:
     def resultants(
         self, coordinates: Array, condyles: "Mapping[str, CondyleWrench]"
     ) -> dict[str, CondylePoint]:
-        """Return a contact's resultants as contact points of the equations.
+        """Return the resultants of a contact as the contact points of the equations.
 
         Args:
+            coordinates: knee coordinates, (6,), m and rad.
             condyles: side -> load on the insert at these coordinates.
         """
         return {
@@ -284,9 +286,11 @@ class Instant:
         condyles: "Mapping[str, CondyleWrench]",
         points: Mapping[str, Array],
     ) -> KneeGeometry:
-        """Return a geometry with a contact's resultants as its contact points.
+        """Return a geometry with the resultants of a contact as its contact points.
 
         Args:
+            geometry: result of `geometry`.
+            coordinates: knee coordinates, (6,), m and rad.
             condyles: loaded side -> its load on the insert at these coordinates.
             points: side -> point (3,), m, where an unloaded condyle is nearest to the insert.
         """
@@ -302,9 +306,10 @@ class Instant:
     def post_loads(
         self, coordinates: Array, post: "CondyleWrench | None"
     ) -> tuple[PointForces, ...]:
-        """Return the loads on tibia and femur, including friction.
+        """Return the loads of cam and post on tibia and femur, including friction.
 
         Args:
+            coordinates: knee coordinates, (6,), m and rad.
             post: load of the cam on the insert at these coordinates; None: no contact.
         """
         if post is None:

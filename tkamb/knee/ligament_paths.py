@@ -32,7 +32,8 @@ class BundlePaths:
         points: proximal end, points where the path meets and leaves each of w surfaces, distal end,
             m, (n, ..., 2 + 2w, 3). For a surface that is not touched the point before it is
             repeated.
-        wrenches: link -> force and moment about the origin per newton of tension, (n, ..., 6).
+        wrenches: link -> force and moment about the origin per newton of tension, shape
+            (n, ..., 6).
     """
 
     length: Array

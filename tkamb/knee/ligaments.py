@@ -129,6 +129,7 @@ class BundleArrays:
 
     Args:
         proximal: proximal ends in one frame, (m, 3), m.
+        distal: distal ends in one frame, (m, 3), m.
         slack_length: slack lengths, (m,), m.
         wrapping: bundles that wrap, with the links `PROXIMAL` and `DISTAL`.
     """
@@ -150,7 +151,7 @@ class BundleArrays:
 
     @classmethod
     def of(cls, bundles: Sequence[Ligament], proximal: Array, distal: Array) -> "BundleArrays":
-        """Return the arrays of straight bundles with given ends (m, 3), m."""
+        """Return the arrays of straight bundles with the given ends (m, 3), m."""
         return cls(
             proximal.reshape(-1, 3),
             distal.reshape(-1, 3),
@@ -470,12 +471,12 @@ def generic_ligaments(
 
 
 def condylar_axis(femoral: Surface) -> Array:
-    """Return the centre (3,), m, of the circle that fits the posterior condyles, on an axis
-    parallel to z.
+    """Return the centre (3,) of the circle that fits the posterior condyles, m.
 
-    At a flexion phi let u be downward in the femur's frame. The support, the maximum of u . p over
-    the vertices p, is u . c + r for a circle of centre c and radius r; least squares fit c and r to
-    those at 20 to 100 deg. The z of the centre is the middle of the component's width.
+    The axis is parallel to z. At a flexion phi let u be downward in the femur's frame. The support,
+    the maximum of u . p over the vertices p, is u . c + r for a circle of centre c and radius r;
+    least squares fit c and r to those at 20 to 100 deg. The z of the centre is the middle of the
+    component's width.
     """
     flexion = np.deg2rad(np.arange(20.0, 101.0, 5.0))
     down = np.column_stack([-np.sin(flexion), -np.cos(flexion)])

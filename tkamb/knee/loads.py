@@ -120,7 +120,11 @@ class KneeLoads:
 def knee_loads(
     geometry: KneeGeometry, solved: SolvedLoads, friction: float, bridge: Bridge, data: Any
 ) -> KneeLoads:
-    """Return the solved loads in the axes of the user's knee, and as forces on its joints."""
+    """Return the solved loads in the axes of the user's knee, and as forces on its joints.
+
+    Args:
+        data: Pinocchio data with joint placements up to date.
+    """
     unknowns = [] if solved.problems else solved_unknowns(geometry, solved, friction)
     # The first word of an unknown's name is its group. Ligaments are known loads.
     groups: dict[str, list[PointForces]] = {"external": [], "residual": [], "hip": []}

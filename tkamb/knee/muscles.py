@@ -140,8 +140,9 @@ class Line:
         )
 
     def loads(self, path: "TautPath") -> tuple[PointForces, ...]:
-        """Return the forces of a unit tension on the links, the two ends first. Their sum is zero;
-        at an inner point or corner the force is the change of direction.
+        """Return the forces of a unit tension on the links, the two ends first. Their sum is zero.
+
+        The force at an inner point or corner is the change of direction.
         """
         links = [point.link for point in self.points]
         if self.wrap:
@@ -171,7 +172,7 @@ def off_femur(points: Sequence[LinkPoint], chain: "Chain") -> int:
 
 
 def muscle_line(muscle: Muscle, chain: "Chain", femoral: "Surface") -> Line:
-    """Return a line of action, which may wrap the femoral component in the patella's plane.
+    """Return a muscle's line of action. It may wrap the femoral component in the patella's plane.
 
     `femoral` is in the femur link's frame.
     """
@@ -190,7 +191,7 @@ def muscle_line(muscle: Muscle, chain: "Chain", femoral: "Surface") -> Line:
 def check_muscles(muscles: Sequence[Muscle], chain: "Chain") -> None:
     """Raise an error unless there is one muscle, from the femur to the patella.
 
-    Equilibrium does not determine how several muscles share a moment.
+    Equilibrium does not determine how several muscles share the joint moments.
     """
     for muscle in muscles:
         if len({chain.carrier(point.link) for point in muscle.points}) == 1:

@@ -217,7 +217,7 @@ def surfaces_of(
 def placed_insert(
     anatomy: Anatomy, implant: Implant, insert: Surface | None, is_left: bool
 ) -> tuple[FixedFrame, Surface | None]:
-    """Return the insert frame on the tibia, and the insert's surface in it."""
+    """Return the insert frame on the tibia, and the insert's surface in that frame."""
     frame = anatomy.insert
     if insert is None or implant.placed:
         return frame, insert

@@ -22,8 +22,7 @@ class PatellaSettings:
 
     least_determinant: float = 1e-6
     """1: determinant of the unit vectors of contact normal and ligament below which the two are
-    parallel. It is above rounding errors.
-    """
+    parallel. Chosen because it is above rounding errors."""
 
 
 PATELLA = PatellaSettings()
@@ -44,7 +43,7 @@ class PatellaStatus(Enum):
 
     @property
     def found(self) -> bool:
-        """Whether the patella was found; if not, the value states the failed condition."""
+        """Whether the patella was found. If not, the value states the condition that failed."""
         return self in (PatellaStatus.OK, PatellaStatus.SEVERAL, PatellaStatus.EDGE)
 
 
@@ -113,7 +112,7 @@ class ExtensorMechanism:
 class PatellaBalance:
     """Forces on the patella per unit muscle tension, in the patellar joint's frame.
 
-    `moment` is the residual one per unit tension, m; `slopes` as in `PatellaState`.
+    `moment` is the residual moment per unit tension, m. `slopes` are those of `PatellaState`.
     """
 
     coordinates: Array

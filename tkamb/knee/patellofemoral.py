@@ -43,28 +43,23 @@ class PatellofemoralSettings:
     """m: tau of the module's equations. A contact of relative radius R is averaged over a radius of
     about sqrt(R tau). Larger: smoother, less local."""
     sample_spacing: float = 1e-3
-    """m: spacing of the button's samples in the patella's coronal plane. The facets of a mesh have
-    about this size.
-    """
+    """m: spacing of the button's samples in the patella's coronal plane. Chosen because the facets
+    of a mesh have about this size."""
     sample_range: float = 14.0 * patch_depth
-    """m: excess over the smallest distance above which a sample has no weight. The weight at this
-    excess is exp(-14) = 8e-7: the gap of a patch of twenty samples jumps by 3e-11 m when a sample
-    loses its weight.
-    """
+    """m: excess over the smallest distance above which a sample has no weight. Chosen because the
+    weight at this excess is exp(-14) = 8e-7: the gap of a patch of twenty samples jumps by 3e-11 m
+    when a sample loses its weight."""
     coarse_samples: int = 60
     """Samples of the quick check for touch. Not studied."""
     lateral_compliance: float = 0.01
-    """m: c of the module's equations, the shift under a purely lateral contact force. It is soft
-    enough for a smooth search.
-    """
+    """m: c of the module's equations, the shift under a purely lateral contact force. Chosen soft
+    enough for a smooth search."""
     tilt_compliance: float = 10.0
-    """rad/m: d of the module's equations. A force 10 mm beside the middle tilts by 5.7 deg. It is
-    soft enough for a smooth search.
-    """
+    """rad/m: d of the module's equations. A force 10 mm beside the middle tilts by 5.7 deg. Chosen
+    soft enough for a smooth search."""
     least_sagittal_part: float = 1e-9
-    """1: sagittal part of a unit normal below which the normal has no sagittal direction. It is
-    above rounding errors.
-    """
+    """1: sagittal part of a unit normal below which the normal has no sagittal direction. Chosen
+    because it is above rounding errors."""
 
 
 PATELLOFEMORAL = PatellofemoralSettings()
@@ -257,7 +252,7 @@ def _store_samples(
     normal: Array,
     on_edge: Array,
 ) -> None:
-    """Store distances, nearest points and normals of m of the n samples.
+    """Store the distances, nearest points and normals of m of the n samples.
 
     Args:
         indices: indices of the samples, (m,).
@@ -331,7 +326,7 @@ def _mean_over_sides(
 
 @compiled_as_written
 def _contact_of_sides(sides: Array, middle: float, compliances: Array, contact: Array) -> float:
-    """Compute the contact by the module's equations; return the normal's sagittal part.
+    """Compute the contact by the module's equations, and return the normal's sagittal part.
 
     Args:
         sides: gap, point, normal and share on edges of the left and the right side, (2, 8).

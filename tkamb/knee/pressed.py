@@ -122,7 +122,7 @@ def contact_of_equations(result: ContactResult, left: bool) -> ContactResult:
 
 @dataclass(frozen=True, eq=False)
 class PressBatch:
-    """The presses of n poses; NaN for a failed press, zero for an unloaded condyle.
+    """The presses of n poses. A press that failed has NaN; an unloaded condyle has zero.
 
     Args:
         force: contact forces of the medial and lateral condyle, (n, 2), N.

@@ -64,7 +64,7 @@ class Relaxation:
 
         Args:
             measured: compliance at the last equilibrium, from `ReleasedForces.tension_per_wrench`,
-                (6,); None: unknown.
+                shape (6,); None: unknown.
         """
         self._passes, self.compliance_error = self._passes + 1, 0.0
         last_compliance, self._compliance = self._compliance, measured

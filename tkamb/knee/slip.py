@@ -215,7 +215,7 @@ def roll_slip_motion(
 def _mean_condyle(lowest: LowestPoints, poses: Array) -> tuple[Array, Array]:
     """Return arms (f, 3), m, and femoral arcs (f-1,), m, as means over the condyles.
 
-    An arm goes from the femoral origin to the lowest point; both depend on the rotations alone.
+    An arm goes from the femoral origin to the lowest point. Both depend on the rotations alone.
     """
     condyle_points = [[point for point in lowest.at(pose) if point is not None] for pose in poses]
     points = np.array(condyle_points).swapaxes(0, 1)

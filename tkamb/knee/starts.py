@@ -57,7 +57,7 @@ class InitialPoses:
     def equilibrium(
         self, instant: Instant, previous: Sequence[KneeEquilibrium], points: dict[str, Array]
     ) -> KneeEquilibrium:
-        """Return the equilibrium from the first guess from which the search succeeds.
+        """Return the equilibrium from the first initial guess from which the search succeeds.
 
         If it is farther than `INITIAL_POSE.max_continuation` from that guess, the search is
         repeated from others; `second` of the result describes another equilibrium at which such a
@@ -125,7 +125,7 @@ class InitialPoses:
     def _guesses(self, recorded: Array, previous: list[Array]) -> Iterator[Array]:
         """Yield up to three initial guesses: extrapolated, of the last frame, and recorded.
 
-        The extrapolated one keeps its height; the others are at first touch.
+        The extrapolated guess keeps its height; the others are at first touch.
         """
         rows = list(self._knee.released)
         for number, released_guess in enumerate(
@@ -157,14 +157,14 @@ class InitialPoses:
 
 
 def _distance(first: Array, second: Array) -> float:
-    """Return the largest distance (m), rotations times the lever arm."""
+    """Return the largest distance (m) between coordinates (6,), rotations times the lever arm."""
     return float(np.abs((second - first) * SCALE).max())
 
 
 def extrapolated(previous: list[Array]) -> Array:
     """Return coordinates (6,) extrapolated from up to three frames.
 
-    The last step is repeated with a factor from 0 to 1, its projection on the step before. A
+    The last step is repeated with a factor from 0 to 1, its projection on the previous step. A
     lightly loaded knee moves irregularly, hence the limit `INITIAL_POSE.max_extrapolation`.
     """
     if len(previous) < 3:

@@ -85,7 +85,7 @@ def _no_push(start: Array) -> Array:
 
 
 def _polar(points: Array) -> tuple[Array, Array]:
-    """Return distances (f,), m, from the z axis and polar angles (f,), rad."""
+    """Return distances (f,), m, from the z axis and polar angles (f,), rad, of points (f, 3), m."""
     return np.hypot(points[:, 0], points[:, 1]), np.arctan2(points[:, 1], points[:, 0])
 
 
@@ -96,8 +96,10 @@ def _wrapped(angles: Array) -> Array:
 def _around(
     distances: tuple[Array, Array], sweep: Array, radius: float
 ) -> tuple[Array, Array, tuple[Array, Array]]:
-    """Return a taut string around a circle. `distances` (f,), m, of its ends are from the centre.
-    `sweep` (f,), rad, is the signed angle about it from start to end, on the string's side.
+    """Return a taut string around a circle.
+
+    `distances` (f,), m, of start and end are from the centre; `sweep` (f,), rad, is the signed
+    angle about it from start to end, on the string's side.
 
     Returns:
         Signed angle of the arc (f,), rad, zero if the string does not touch; angle (f,) from the
@@ -206,7 +208,7 @@ def _torus(start: Array, end: Array, ring: float, tube: float) -> WrapTouch:
     rows = np.arange(len(start))
 
     def at(places: Array) -> tuple[WrapTouch, Array, Array]:
-        """Return touching points, lengths (f,), m, and cylinder frames at angles (f,), rad."""
+        """Return touching points, lengths (f,), m, and frames of cylinders at angles (f,), rad."""
         inward = -np.column_stack([np.cos(places), np.sin(places), np.zeros_like(places)])
         up = np.broadcast_to([0.0, 0.0, 1.0], inward.shape)
         frame = np.stack([inward, up, np.cross(inward, up)], axis=1)
@@ -378,7 +380,7 @@ class _Strings:
         self.order[rows] = np.take_along_axis(order, closed, axis=1)
 
     def insert(self, w: int, free: Index) -> None:
-        """Wrap strings around object w, in the first straight part that meets it."""
+        """Wrap some strings around object w, in the first straight part that meets it."""
         for gap in range(len(self.wraps)):
             free = free[(self.order[free] >= 0).sum(axis=1) >= gap]
             if not len(free):
@@ -407,7 +409,7 @@ class _Strings:
 
 
 def _moved(poses: Array, points: Array) -> Array:
-    """Return points (f, 3), each moved by its pose (f, 4, 4)."""
+    """Return points (f, 3), each transformed by its own pose (f, 4, 4)."""
     return np.einsum("fij,fj->fi", poses[:, :3, :3], points) + poses[:, :3, 3]
 
 

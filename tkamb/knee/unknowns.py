@@ -49,9 +49,8 @@ class ContactPointSettings:
     """m: a femoral component with a larger gap or penetration is misplaced. It is
     larger than the errors of fluoroscopy."""
     standstill_speed: float = 1e-3
-    """m/s: v0 of the regularised friction. Friction fades below this sliding speed, which is far
-    below that of a moving knee.
-    """
+    """m/s: v0 of the regularised friction. Friction fades below this sliding speed.
+    It is far below the sliding speed of a moving knee."""
 
 
 CONTACT_POINT = ContactPointSettings()
@@ -223,7 +222,7 @@ def condyle(side: str, contact: CondylePoint, friction: float) -> Unknown:
 
 
 def residuals(point: Array, lifted: bool, extensor: bool) -> list[Unknown]:
-    """Return the loads on the tibia that are zero in an exact model.
+    """Return the residuals, loads on the tibia that are zero in an exact model.
 
     Args:
         point: midpoint of the contact points, where the residual forces act, (3,), m.
@@ -318,7 +317,7 @@ def wrong_signs(state: LoadState, solution: Solution) -> list[str]:
 def contradictions(
     state: LoadState, solutions: Mapping[LoadState, Solution], lifted_by_gap: frozenset[str]
 ) -> list[str]:
-    """Return why a load state is inadmissible; empty: it is admissible.
+    """Return reasons why a load state is inadmissible; empty: it is admissible.
 
     It is a load of the wrong sign, or a zero load that would act with the right sign. `solutions`
     has those of all states.

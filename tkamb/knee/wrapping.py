@@ -31,6 +31,7 @@ class TautPath:
 
     Args:
         points: start, touched corners of the outline, end, (m, 3), m.
+        length: length of the path, m.
         wrap_angle: change of direction in the bone's sagittal plane, rad; 0: straight.
     """
 
@@ -51,12 +52,12 @@ class TautPath:
 
     @property
     def start_direction(self) -> Array:
-        """Unit vector (3,) along the string at its start, which tension pulls this way."""
+        """Unit vector (3,) along the string at its start. Tension pulls the start this way."""
         return np.asarray(self.directions[0])
 
     @property
     def end_direction(self) -> Array:
-        """Unit vector (3,) along the string at its end, which tension pulls the opposite way."""
+        """Unit vector (3,) along the string at its end. Tension pulls the end the opposite way."""
         return np.asarray(self.directions[-1])
 
     def moved(self, pose_here_in_there: Array) -> "TautPath":

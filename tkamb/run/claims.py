@@ -103,6 +103,7 @@ def peaks(
 
     Args:
         bands: columns of bands.csv; empty: no input was varied.
+        body_weight: body weight, N.
 
     Returns:
         Force -> column, nominal, frame, time_s, flexion_deg, supported (False: the two estimates of
@@ -198,7 +199,7 @@ class MethodError:
 
     @property
     def sentences(self) -> list[str]:
-        """Sentences on the errors, first on an activity without measurement."""
+        """Sentences on the errors, first on an activity without a measurement."""
         return texts.lines("tkamb.run", "error.txt", error=self, groups=self.groups)
 
     @property
@@ -220,7 +221,11 @@ def bias_words(trials: Sequence[MeasuredTrial]) -> str:
 
 
 def method_error(summary: Mapping[str, Any]) -> MethodError:
-    """Return the measured error of the method that applies to a run."""
+    """Return the measured error of the method that applies to a run.
+
+    Args:
+        summary: content of summary.json; `activity` and `scene_tables` are used.
+    """
     activity = summary.get("activity")
     muscles = bool((summary.get("scene_tables") or {}).get("muscles"))
     alike = tuple(one for one in measured_trials() if one.muscles is muscles)
@@ -246,7 +251,7 @@ def claims_summary(columns: Mapping[str, Any], body_weight: float) -> dict[str, 
 
 
 def peaks_of(results: "Results") -> dict[str, dict[str, Any]]:
-    """Return the peak forces of a run with bands (`peaks`)."""
+    """Return the peak forces of a run with their bands (`peaks`)."""
     from tkamb.run.metrics import body_weight
 
     return peaks(results.columns, results.bands, body_weight(results))

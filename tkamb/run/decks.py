@@ -182,8 +182,10 @@ class PressProblem:
 
     Args:
         pair: insert and femoral component.
+        lattice: grid of the insert with contact nodes on the smooth surface.
         nodes: contact nodes, (c,).
-        nodes: contact nodes, (c,).
+        map: contact surface of the insert.
+        pose: pose_femoral_in_insert at the guessed depth, (4, 4).
         depth: guessed approach, m.
         touchable: mask of the contact nodes that can touch, (c,).
         patch: femoral triangles above these nodes, insert frame.
@@ -206,6 +208,8 @@ def press_problem(pair: ContactPair, load: float, pose: Array, grid_mm: float) -
     """Return a press as a finite-element problem.
 
     Args:
+        pair: insert and femoral component.
+        load: load along -y, N.
         pose: pose_femoral_in_insert, (4, 4); its y is not used.
         grid_mm: edge of the hexahedra, mm.
 
@@ -251,6 +255,7 @@ class FramePress:
     Args:
         problem: problem at the pose of the frame, except for its y. The load is the vertical sum of
             the frame's nodal forces.
+        approach: approach in the run, m.
         peak_pressure: largest pressure of the map, Pa.
         origin: text with frame number, folder of the run and contact model.
         lateral: direction of insert z, "lateral" or "medial".

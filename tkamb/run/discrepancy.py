@@ -82,9 +82,9 @@ FEWEST_FRAMES = 5
 PUBLISHED = {"total": (0.43, 1), "medial": (0.41, 4), "lateral": (0.43, 4)}
 """Force -> published root mean square error in walking (BW), and the number of published errors.
 
-Total: a blind prediction, 281 N (parametric model, third Grand Challenge, PMC3627216), by JW's
-weight. Medial and lateral: the middle of 229 to 312 N and of 238 to 326 N by the four winners of
-the Grand Challenges (Kinney et al. 2013, doi:10.1115/1.4023255).
+Total: a blind prediction, 281 N (parametric model, third Grand Challenge, PMC3627216), divided by
+JW's weight. Medial and lateral: the middle of 229 to 312 N and of 238 to 326 N by the four winners
+of the Grand Challenges (Kinney et al. 2013, doi:10.1115/1.4023255).
 """
 
 
@@ -264,7 +264,7 @@ def coverage(low: Array, high: Array, measured: Array) -> tuple[int, float]:
 
 @lru_cache(maxsize=1)
 def known_errors() -> tuple[TrialError, ...]:
-    """Return the errors of all compared trials, which the package stores."""
+    """Return the errors of all compared trials from the package's data."""
     return tuple(TrialError(**row) for row in json.loads(DATA.read_text(encoding="utf-8")))
 
 
@@ -278,8 +278,9 @@ def write_errors(errors: Sequence[TrialError], path: Path = DATA) -> None:
 
 
 def discrepancy_of(summary: Mapping[str, Any]) -> dict[str, Discrepancy]:
-    """Return force -> discrepancy of a run in its activity; empty without [muscles], which all
-    compared runs had.
+    """Return force -> discrepancy of a run in its activity; empty without [muscles].
+
+    All compared runs had [muscles].
     """
     if "muscles" not in (summary.get("scene_tables") or {}):
         return {}

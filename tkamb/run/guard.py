@@ -142,7 +142,7 @@ def _is_harmless(character: str) -> bool:
 
 
 class _PrintableFormatter(logging.Formatter):
-    """Escapes control characters, which quoted files could contain to alter a terminal."""
+    """Escapes control characters: messages quote texts from files, which could alter a terminal."""
 
     def format(self, record: logging.LogRecord) -> str:
         return printable(super().format(record))
@@ -246,6 +246,6 @@ def _write_log(error: Exception, options: argparse.Namespace) -> Path | None:
 
 
 def _log_folders(out: Path | None) -> list[Path]:
-    """Return the output folder, its parent, the working and the temporary directory."""
+    """Return the output folder and its parent, the working and the temporary directory."""
     beside = [] if out is None else [out, out.parent]
     return [*(path for path in beside if path.is_dir()), Path.cwd(), Path(tempfile.gettempdir())]

@@ -33,7 +33,7 @@ GROUPS = {
 
 
 CODE, CONTACT_CODE = "code of tkamb", "code of the contact model"
-"""Keys of the identity: the hashes of tkamb and of a plug-in."""
+"""Keys of the identity for the hashes of tkamb and of a plug-in."""
 SUFFIXES = (".py", ".so", ".pyd")
 
 
@@ -81,7 +81,7 @@ def scene_hash(scene: "Scene") -> str:
 
 
 def scene_content(scene: "Scene") -> Any:
-    """Return the scene as JSON types, with the SHA-256 of a file's content in place of its path."""
+    """Return the scene as JSON types, with the SHA-256 of the content in place of each path."""
     unused: dict[str, Any] = {"base": True, "output": {"directory"}, "wear": True}
     unused |= {} if scene.material else {"material": True}
     if scene.contact and scene.contact.patellofemoral is None:  # the hash of earlier releases

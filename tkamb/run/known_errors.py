@@ -220,6 +220,10 @@ def known_error(
 ) -> KnownError | None:
     """Return the known error of a setting; None: not measured, as plug-ins, other spacings than the
     study's and materials but polyethylene and polyethylene-linear.
+
+    Args:
+        model: name of the contact model. Plug-ins were not measured.
+        resolution_mm: spacing of the map points, mm. Only the spacings of the study were measured.
     """
     label = setting_label(model, options or {})
     return known_errors().get((label, float(resolution_mm), material))
@@ -242,7 +246,7 @@ def as_json(error: KnownError | str | None) -> dict[str, Any] | str:
 
 
 def known_error_words(error: Mapping[str, Any] | str, names: Iterable[str]) -> str:
-    """Return sentences on the known errors of some quantities."""
+    """Return full sentences on the known errors of some quantities."""
     if isinstance(error, str):
         return f"The error of this setting of the contact model is {error}."
     names = list(names)

@@ -42,6 +42,9 @@ class NotingFile(io.FileIO):
 
     Attributes:
         failure: error of the first failed write; None if every write has succeeded.
+
+    Raises:
+        OSError: the file cannot be opened.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -252,7 +255,7 @@ class MapWriter:
         return ContactMaps(arrays, dict(self._file.attrs))
 
     def close(self) -> None:
-        """Write the remaining frames and close the file.
+        """Write the appended frames and close the file.
 
         Raises:
             InputError: the file cannot be written.
@@ -270,7 +273,7 @@ class MapWriter:
 
     @contextmanager
     def _written(self) -> Iterator[None]:
-        """Raise an InputError for an error of HDF5, as on a full disk."""
+        """Raise an InputError for an error of HDF5, such as on a full disk."""
         try:
             yield
             if self._stream is not None:
@@ -490,7 +493,7 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 FILTERS = frozenset({h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE})
-"""Compression filters that tkamb uses; any other could load a library."""
+"""Compression filters that tkamb uses. Any other filter could load a library."""
 
 
 def check_maps_file(file: Any) -> None:

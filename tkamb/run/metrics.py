@@ -154,7 +154,7 @@ def failed(results: "Results") -> NDArray[np.bool_]:
 
 
 def flagged(results: "Results") -> NDArray[np.bool_]:
-    """Return a mask (f,) of frames with numbers and a status other than "ok"."""
+    """Return a mask (f,) of the frames with numbers and a status other than "ok"."""
     return ~_clean(results) & ~failed(results)
 
 

@@ -79,6 +79,7 @@ class PressReport:
     Args:
         resolution_mm: spacing of the map points, mm.
         nodes: number of nodes of lattice or mesh; of map points for a model without nodes.
+        load: load, N.
         result: contact result in the insert frame (mirrored for a left knee).
         adjustment: femoral adjustment before contact; None: without.
         triangles: indices of neighbouring map points, (k, 3).

@@ -90,7 +90,7 @@ def recording_of(
     split_sensitivity: bool = True,
     cam: "CamPost | None" = None,
 ) -> Recording:
-    """Return the knee of a case in the frames of its motion, with a contact that is not prepared.
+    """Return the knee of a case in the frames of its motion. The contact is not prepared here.
 
     Args:
         shared: state of the nominal case, for a sample; None: the case is no sample.

@@ -74,6 +74,9 @@ def compare_measured(
 
     Pearson's r and the peaks. The frames are counted as compared, failed, without measurement, or
     without prediction (not failed, but NaN).
+
+    Args:
+        body_weight: body weight, N.
     """
     failed = np.array([status.startswith(FAILED) for status in columns["status"]], bool)
     missing = np.full(len(failed), np.nan)
@@ -192,7 +195,7 @@ def _correlations(a: Array, rows: Array) -> Array:
 
 
 def _lag(envelopes: "Envelopes", muscle: str, time: Array, activation: Array) -> float:
-    """Return the lag, s, of the largest correlation; NaN at an end of the range."""
+    """Return the lag, s, of the largest correlation; NaN without a maximum inside the range."""
     shifted = envelopes.at(muscle, time - LAGS[:, None])
     finite = np.isfinite(shifted).all(axis=0)
     r = _correlations(activation[finite], shifted[:, finite])
@@ -209,7 +212,11 @@ WHY_NOT = {
 
 
 def comparison_words(comparison: Mapping[str, Mapping[str, Any]]) -> tuple[str, str, bool]:
-    """Return the RMSE of the first force, all errors in words, and whether frames are left out."""
+    """Return the RMSE of the first force, all errors in words, and whether frames are left out.
+
+    Args:
+        comparison: force -> errors from `compare_measured`.
+    """
     (_, one), *others = comparison.items()
     counts = [_count_words(one)]
     counts += [f"{n}: {words}" for n, o in others if (words := _count_words(o)) != counts[0]]

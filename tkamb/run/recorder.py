@@ -319,6 +319,7 @@ class FolderRecorder(Recorder):
 
     Args:
         directory: folder that this process has claimed (`tkamb.io.claim`).
+        resume: whether to continue an earlier run in the folder.
     """
 
     def __init__(self, directory: Path, identity: Mapping[str, Any], resume: bool) -> None:
@@ -332,11 +333,11 @@ class FolderRecorder(Recorder):
     def begin_maps(
         self, name: str, points: Array, triangles: Array, labels: Mapping[str, Any]
     ) -> None:
-        """See `Recorder`; the file is created with the first frame."""
+        """See `Recorder`. The file is created with the first frame."""
         self._map_arguments[name] = (points, triangles, labels)
 
     def take_earlier(self, frames: range) -> dict[int, dict[str, Array] | None]:
-        """See `Recorder`; only frames before the first absent one are read."""
+        """See `Recorder`. Only frames before the first absent frame are read."""
         shards = {}
         for frame in frames if self._shards.resumed else ():
             shard = self._shards.get(frame)
@@ -347,7 +348,7 @@ class FolderRecorder(Recorder):
         return shards
 
     def record(self, frame: int, row: Row, contact: dict[str, Array] | None) -> None:
-        """See `Recorder`; an interrupt is delayed until the frame is written."""
+        """See `Recorder`. An interrupt is delayed until the frame is written."""
         with interrupt_later():
             self._shards.put(frame, Shard(row, contact))
             self._record(frame, row, contact)

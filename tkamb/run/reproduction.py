@@ -50,7 +50,7 @@ studied. Measured on one x86 processor against a run with one thread, largest of
     knee bend, foundation, adduction released, 5 frames: two threads 0, Nehalem 2e-12
     gait with all muscles, four coordinates released, 4 frames: two threads 0, others 1e-9"""
 COUNTS = ("iterations", "contact_trials", "coupling_iterations", "condition_number")
-"""Columns that depend on the way of the solver only."""
+"""Columns that depend on the way of the solver, not on its result."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,9 @@ class Verdict:
 
 
 def verify_results(directory: str | Path, inputs: str | Path | None = None) -> Verdict:
-    """Compare a folder with the SHA-256 in its summary.json, without writing.
+    """Compare a folder with the SHA-256 in its summary.json.
+
+    Nothing is written.
 
     Args:
         inputs: folder with copies of scene and inputs, at any depth. Default: the folder `inputs`
@@ -192,7 +194,11 @@ class Rerun:
 
 
 def rerun(directory: str | Path, inputs: str | Path | None = None) -> Rerun:
-    """Compute a run again and compare all columns with the stored ones."""
+    """Compute a run again and compare all columns with the stored ones.
+
+    Args:
+        inputs: as in `verify_results`.
+    """
     from tkamb.io.scene import load_scene
     from tkamb.run.simulation import simulate
 
@@ -213,7 +219,7 @@ def rerun(directory: str | Path, inputs: str | Path | None = None) -> Rerun:
 
 
 def compared_runs(stored: "Results", again: "Results") -> Rerun:
-    """Return the differences of two computations of a run, by column."""
+    """Return the differences of the columns of two computations of a run."""
     if len(stored) != len(again):
         what = f"has {len(stored)} frames, its scene gives {len(again)}"
         raise InputError(what, "results", "`tkamb verify` names changed inputs")

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 FOLDER = ".frames"
 IDENTITY_NAME = "run.json"
 OWN_NAMES = (IDENTITY_NAME, "contact.h5", "button.h5", "*.frame", ".tkamb-*.part")
-"""Patterns of the files in `.frames`; no other file is removed from it."""
+"""Patterns of the files in `.frames`. No other file is removed from it."""
 CSV_NAME, SUMMARY_NAME, REPORT_NAME = "results.csv", "summary.json", "report.html"
 MAPS_NAME, BUTTON_NAME = "contact.h5", "button.h5"
 METADATA_NAME = "results.csv-metadata.json"
@@ -230,7 +230,7 @@ UNITS = {
     "Nm": "N·m",
     **{unit: unit for unit in ("N", "mm", "MPa", "deg", "s", "BW")},
 }
-"""End of a column's name -> its unit, longer ends first."""
+"""End of a column's name -> its unit. Longer ends come first."""
 DATATYPES = {"text": "string", "integer": "integer"}
 
 

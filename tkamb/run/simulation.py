@@ -83,7 +83,7 @@ class FrameSolver:
         return k, frame_row(self._case, k, frame, self.slips, status), frame_arrays(frame)
 
     def _keep(self, frame: "Frame") -> None:
-        """Store the start; only the last one of a contact has a warm start, which is large."""
+        """Store the start. Only the last one of a contact has a warm start, which is large."""
         if frame.contact is not None:
             self.before = [replace(each, contact=None) for each in self.before]
         self.before.append(frame.next)
@@ -128,7 +128,7 @@ def finished_in_order(
     """Yield frames from worker processes in their order.
 
     Args:
-        indices: all frames of the run, which determine the chunks.
+        indices: all frames of the run. They determine the chunks.
 
     Raises:
         ComputationError: a worker was killed.

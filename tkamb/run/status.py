@@ -122,13 +122,11 @@ class StatusSettings:
     """m: largest translation of a recorded pose by the filter without a flag. The
     error of fluoroscopy is smaller."""
     filter_rotation: float = 0.5 * DEGREE
-    """rad: largest rotation of a recorded pose by the filter without a flag. The error of
-    fluoroscopy is smaller.
-    """
+    """rad: largest rotation of a recorded pose by the filter without a flag, 0.5 deg.
+    The error of fluoroscopy is smaller."""
     flank_angle: float = 20.0 * DEGREE
-    """rad: largest angle of a condyle's contact normal from the vertical without a flag. Steeper
-    contact is on eminence or lip.
-    """
+    """rad: largest angle of a condyle's contact normal from the vertical without a flag, 20 deg.
+    Steeper contact is on eminence or lip."""
     adjusted_total_BW: float = 0.01
     """BW: largest change of the total force by the femoral adjustment without a flag.
     The adjustment should change the split only."""
@@ -214,6 +212,7 @@ def out_of_equilibrium(across: Array | float, normal: Array | float, body_weight
     Args:
         across: patellofemoral force across the button's normal, N.
         normal: patellofemoral force along it, N.
+        body_weight: body weight, N.
     """
     limit = np.maximum(PATELLA_ACROSS * np.abs(normal), PATELLA_LIGHT * body_weight)
     return np.asarray(np.abs(across) > limit)

@@ -67,6 +67,7 @@ def summary_of(
     """Return the content of summary.json (docs/results.md).
 
     Args:
+        path: path of the scene file; None: the scene is not from a file.
         strains: ligament bundle -> strains at `STRAIN_FLEXIONS`.
     """
     scene = case.scene
@@ -154,7 +155,7 @@ def measures(case: Case, columns: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _thickness(columns: Mapping[str, Any]) -> dict[str, list[float]]:
-    """Return the range of the thickness below the centres of pressure, mm."""
+    """Return the range of the insert's thickness below the centres of pressure, mm."""
     sides = [columns[f"{side}_thickness_mm"] for side in SIDES]
     thickness = np.concatenate(sides).astype(float)
     thickness = thickness[np.isfinite(thickness)]

@@ -82,7 +82,7 @@ CLOCKS = {
 
 @dataclass(eq=False)
 class Profile:
-    """Profile of a run, with imported modules and opened files from its creation."""
+    """Profile of a run. It records imported modules and opened files from its creation."""
 
     opened: list[Path] = field(default_factory=list)
 
@@ -94,8 +94,8 @@ class Profile:
         """Return times, files, modules and libraries of the run as a JSON object.
 
         Args:
-            scene: path of the scene file. Of the opened files those in its folder or named by it
-                are listed.
+            scene: path of the scene file. Only opened files in its folder and files that the scene
+                names are listed.
         """
         seconds = dict(results.summary["seconds"])
         total = seconds.pop("all")

@@ -93,7 +93,8 @@ def _cluster_answers(
 
 
 _one_at_a_time = threading.Lock()
-"""Lock for the jobs of a worker with several threads, whose shared state is not thread-safe."""
+"""Lock for the jobs of a worker with several threads, since their shared state is not
+thread-safe."""
 
 
 def answer(packed: bytes, number: int, job: Any) -> Any:

@@ -108,7 +108,7 @@ def horizontal_axis(results: "Results", kind: str | None = None) -> HorizontalAx
 
 
 def _stances(results: "Results", start: float, end: float) -> tuple[tuple[float, float], ...]:
-    """Return begin and end of the measured stances, within `start` and `end`, s."""
+    """Return begin and end of the measured stances, limited to `start` and `end`, s."""
     stance = (results.summary.get("gait") or {}).get("stance_s") or ()
     cut = [(max(float(on), start), min(float(off), end)) for on, off in stance]
     return tuple((on, off) for on, off in cut if on < off)

@@ -119,7 +119,7 @@ class Run:
     """One folder of results.
 
     Args:
-    pairing: pairing of a folder with the first run; None: frames cannot be paired.
+        pairing: pairing with the frames of the first run; None: frames cannot be paired.
     """
 
     label: str
@@ -301,7 +301,7 @@ def _unlike_tables(runs: Sequence[Run]) -> list[str]:
 
 
 def _flat(value: Any, name: str = "") -> dict[str, Any]:
-    """Return dotted key -> value of nested tables, with numbers in lists of tables."""
+    """Return dotted key -> value of nested tables. Entries of lists of tables have numbers."""
     if isinstance(value, list) and any(isinstance(one, dict) for one in value):
         value = {str(one.get("name", k)): one for k, one in enumerate(value)}
     if not isinstance(value, dict):
@@ -311,8 +311,9 @@ def _flat(value: Any, name: str = "") -> dict[str, Any]:
 
 
 def _unlike_inputs(runs: Sequence[Run]) -> list[str]:
-    """Return a sentence for each input file of other content. One that only some runs read is in a
-    setting.
+    """Return a sentence for each input file whose content differs.
+
+    A file that only some runs read is in a setting.
     """
     inputs = [run.results.summary.get("inputs") or {} for run in runs]
     return [

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 WIDTH, HEIGHT = 5.4, 2.7
 DASHES = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.2, 1.2, 1.2)))
-"""Line styles, which distinguish runs without colour and where they coincide."""
+"""Line styles: runs can be distinguished without colour, and where they coincide."""
 
 
 # 1: distance between the rows of crosses that mark failed frames, as a share of the plot's height.

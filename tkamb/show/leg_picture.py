@@ -336,7 +336,7 @@ def draw_registration(
 
 
 def _straight(links: "Links", segments: "Sequence[ModelSegment]") -> dict[str, Array]:
-    """Return segment -> pose (4, 4) in the shank of the straight leg."""
+    """Return segment -> its pose (4, 4) in the shank of the straight leg."""
     thigh = links.insert_in_tibia @ knee_pose(links.neutral)
     poses = {"shank": np.eye(4), "thigh": thigh}
     for s in segments:

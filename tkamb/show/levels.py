@@ -62,6 +62,7 @@ class PageGrid:
 
     Args:
         points: points (n, 3) of the insert's surface, m, insert frame.
+        triangles: (k, 3) indices into the points.
         sign: 1.0: the page's right is insert +z; -1.0: it is insert -z.
         step_mm: distance between neighbouring grid points, mm.
     """

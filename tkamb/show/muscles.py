@@ -132,8 +132,9 @@ def _sum(results: "Results", family: str, names: tuple[str, ...]) -> Array:
 
 
 def activation_cells(results: "Results") -> list[Cell]:
-    """Return a plot per muscle of a knee group, which crosses the knee, and per EMG channel of
-    others.
+    """Return the small plots: one per muscle of a knee group, and one per EMG channel of others.
+
+    A group is a knee group if one of its muscles crosses the knee.
     """
     emg: Mapping[str, Any] = (results.summary.get("emg") or {}).get("muscles", {})
     cells: list[Cell] = []

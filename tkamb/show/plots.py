@@ -41,7 +41,7 @@ FOOT, OVERHANG, AXIS_LABEL = 31.5, 13.0, 13.0
 """Points: height of the labels under a plot; half the width of the last tick label; width of the
 label of the vertical axis."""
 SIDE_LABEL, LEGEND = 8.0, 8.5
-"""Points: font sizes of labels beside a plot and of the legend."""
+"""Points: font sizes of the labels beside a plot and of the legend."""
 
 
 # Points: distance of an axis label from the edge of the figure. Chosen by eye.
@@ -186,7 +186,7 @@ def _place_alone(axes: Axes, panel: Panel) -> bool:
 
 
 def _legend_width(panel: Panel, columns: int) -> float:
-    """Return the width of the legend by `legend_above`, points."""
+    """Return the width of the legend made by `legend_above`, points."""
     texts = [text_width(line.label, LEGEND) for line in panel.lines]
     rows = -(-len(texts) // columns)
     wide = [max(texts[k : k + rows]) for k in range(0, len(texts), rows)]

@@ -132,7 +132,7 @@ class TopView:
 
 
 def top_view(results: "Results") -> TopView | None:
-    """Return the view of a run's insert; None without maps."""
+    """Return the view of the run's insert; None without maps."""
     if results.maps is None or len(results.maps.triangles) == 0:
         return None
     side = str(results.summary.get("side", "right"))
@@ -164,7 +164,7 @@ def frame_of_peak(results: "Results") -> int | None:
 def draw_maps(
     results: "Results", view: TopView, axis: HorizontalAxis, frames: Sequence[int]
 ) -> Figure:
-    """Return pressure maps of some frames, on a scale to the run's largest."""
+    """Return a figure of pressure maps of some frames, on a scale from 0 to the run's largest."""
     largest = 0.0 if results.maps is None else float(np.nanmax(results.maps.peaks_Pa)) / MEGAPASCAL
     scale = Normalize(0.0, largest if largest > 0 else 1.0)
     across = min(4, len(frames))
@@ -231,7 +231,7 @@ def place_maps(figure: Figure, down: int, across: int, gap: float) -> tuple[list
 
 
 def pressure_bar(figure: Figure, scale: Normalize, **place: Any) -> Colorbar:
-    """Return the colour bar of maps with a common scale, MPa."""
+    """Return the colour bar of pressure maps with a common scale, MPa."""
     bar = figure.colorbar(ScalarMappable(scale, PRESSURE_MAP), **place)
     bar.set_label("contact pressure (MPa)")
     return bar

@@ -56,7 +56,7 @@ POLICY = (
     "default-src 'none'; script-src {script}; style-src-elem {style}; "
     "style-src-attr 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
 )
-"""Security policy: only the page's script runs, and nothing is loaded from elsewhere."""
+"""Security policy: the browser runs only the page's script and loads nothing from elsewhere."""
 THIRD = 2 / 3 * WIDTH
 """Inches: width of a plot in a row of three."""
 SCRIPTS = ("cursor.js", "units.js", "insert.js", "downloads.js", "start.js")

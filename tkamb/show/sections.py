@@ -253,7 +253,7 @@ OTHER_WEAR = (
 def wear_section(results: "Results") -> dict[str, Any] | None:
     """Return the content of the section on wear; None: the folder has no wear.json.
 
-    For a wear.json of another scene or other frames it states only this.
+    If wear.json belongs to another scene or other frames, the section states only this.
     """
     result, folder = wear_of_run(results), results.directory
     if result is None or folder is None:
@@ -335,7 +335,7 @@ def _wear_legend(wear: dict[str, Any], bands: dict[str, Any]) -> str:
 
 
 def _wear_range(wear: dict[str, Any], key: str) -> str:
-    """Return the range of a number over that of the wear factor, in words."""
+    """Return in words the range of a number over the range of the wear factor."""
     limits = wear.get(f"{key}_range")
     return "–" if limits is None else f"{_significant(limits[0])} to {_significant(limits[1])}"
 
@@ -491,7 +491,7 @@ def _weights(markers: Mapping[str, Any]) -> str:
 
 
 def _laws(tables: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
-    """Return name -> words and source of ligament laws; generic bundles are "two-line"."""
+    """Return name -> words and source of the ligaments' laws. Generic bundles are "two-line"."""
     names = {one["law"] for one in tables.get("ligament") or ()} | {"two-line"}
     laws = {name: LIGAMENT_LAWS.find(name) for name in LIGAMENT_LAWS.names() if name in names}
     return {name: (law.words, law.source) for name, law in laws.items()}

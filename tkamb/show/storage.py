@@ -88,7 +88,9 @@ def write_trc(path: Path, time: Array, markers: Mapping[str, Array], rate_Hz: fl
     """Write markers as a `.trc` file in millimetres. A missing position has empty cells.
 
     Args:
+        time: (n,) s, times of the rows.
         markers: label -> (n, 3) positions, m; NaN where missing.
+        rate_Hz: sampling rate of the recording, Hz.
 
     Raises:
         InputError: the file cannot be written.

@@ -88,7 +88,7 @@ SETTINGS: Any = {
 
 
 def new_figure(width: float, height: float) -> "Figure":
-    """Return an empty figure, size in inches, which needs no display."""
+    """Return an empty figure, size in inches. It needs no display."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
@@ -222,7 +222,7 @@ class Renderer(RendererSVG):
         im: Any,
         transform: Affine2DBase | None = None,
     ) -> None:
-        """Draw a picture (rows, columns, 4), in its own resolution with a transform."""
+        """Draw a picture (rows, columns, 4). With a transform, its resolution is preserved."""
         if transform is None:
             return super().draw_image(gc, x, y, im)
         content, (rows, columns) = im.tobytes(), im.shape[:2]
@@ -239,7 +239,7 @@ class Renderer(RendererSVG):
         self.writer.element("use", href=f"#{name}", transform=f"matrix({matrix})")
 
     def _get_font_height_metrics(self, prop: FontProperties) -> tuple[float, float, float]:
-        """Return ascent, descent and line gap, points, for Matplotlib 3.11 and later."""
+        """Return ascent, descent and line gap, points. Matplotlib 3.11 and later call this."""
         return _letter_heights(prop.copy())
 
     def get_text_width_height_descent(

@@ -40,7 +40,7 @@ NAMES = dict(zip(KEYS, (key.replace("_", " ") for key in KEYS), strict=True)) | 
     "map": "the pressure map (L2)",
 }
 COMPARED_ON, COMPARED_AT_MM = "two condyles", 2.0
-"""Case and cell size, mm, at which the default lattice is compared with finite elements."""
+"""Case and cell size, mm, for the comparison of the default lattice with finite elements."""
 DEFAULT = "lattice"
 
 Setting = tuple[str, float]

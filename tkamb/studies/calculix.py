@@ -78,6 +78,9 @@ def find_program() -> str:
 def run_calculix(text: str, longest: float = LONGEST_SECONDS) -> PeerRun:
     """Run CalculiX on an input deck.
 
+    Args:
+        longest: time limit, s.
+
     Raises:
         InputError: CalculiX is not installed.
         ComputationError: CalculiX stopped with an error or exceeded the time limit.
@@ -264,13 +267,13 @@ def _deformed_map(problem: PressProblem, run: PeerRun) -> ContactMap:
 
 
 def _gaps(problem: PressProblem, pose: Array, deformed: ContactMap) -> Array:
-    """Return (c,) above the deformed nodes, m; inf where no facet is above."""
+    """Return the vertical gaps (c,) above the deformed nodes, m; inf where no facet is above."""
     above, _ = problem.floor.over(deformed.points, pose)
     return np.nan_to_num(above[:, 1] - deformed.points[:, 1], nan=np.inf)
 
 
 def _nodal_forces(problem: PressProblem, pose: Array, run: PeerRun, deformed: ContactMap) -> Array:
-    """Return (c, 3), N: pressure times deformed tributary area."""
+    """Return the forces (c, 3) on the contact nodes, N: pressure times deformed tributary area."""
     stress = run.blocks["contact"]
     pressure = np.zeros(len(deformed.points))
     place = np.searchsorted(problem.nodes, stress[:, 0].astype(np.int64) - 1)

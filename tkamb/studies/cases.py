@@ -60,6 +60,7 @@ def block(
 
     Args:
         height: height of the upper surface, m, as a function of the arrays x and z, m.
+        size: lengths along x and z, m.
         spacing: distance between the vertices of the upper surface, m.
     """
     x, z = (np.linspace(-s / 2, s / 2, max(3, round(s / spacing) + 1)) for s in size)
@@ -85,6 +86,7 @@ def dishes(thickness: float, radius: float, apart: float, rim: float = 2e-3) -> 
 
     Args:
         thickness: thickness under the lowest points of the dishes, m.
+        radius: radius of curvature at the lowest points, m.
         apart: z of the middle of the lateral dish, m; the medial middle is at -apart.
         rim: height of the rim above the lowest points, m.
     """
@@ -204,7 +206,7 @@ def case_names(scene: Path | None = None) -> tuple[str, ...]:
 
 
 def study_case(name: str, scene: Path | None = None) -> StudyCase:
-    """Return the case of a name; `scene` is a user's scene file."""
+    """Return the case with a given name; `scene` is a user's scene file."""
     if name in _ANALYTIC:
         return _ANALYTIC[name](name)
     if name not in case_names(scene):
@@ -374,7 +376,7 @@ class Extreme:
 
     @property
     def pose(self) -> Array:
-        """pose_femoral_in_insert, shape (4, 4)."""
+        """pose_femoral_in_insert, (4, 4)."""
         angles = np.array([self.axial_deg, self.varus_deg, self.flexion_deg]) * DEGREE
         return knee_pose([self.ap_mm * MILLIMETRE, 0.0, self.ml_mm * MILLIMETRE, *angles])
 
@@ -499,7 +501,7 @@ BESIDE_CALCULIX: tuple[dict[str, object], ...] = (
     {"linear": True, "thickness_mm": 4.0},
     {"linear": True, "modulus_MPa": 2000.0},
 )
-"""Extremes with stored results of CalculiX, which `lattice` and `fe` solve on cells of 3 mm."""
+"""Extremes with stored results of CalculiX. `lattice` and `fe` solve them on cells of 3 mm."""
 
 
 def extremes() -> Iterator[Extreme]:

@@ -75,7 +75,7 @@ def _relative(
 
 
 Raster = dict[tuple[int, int], float]
-"""Raster point (i along x, j along z) -> pressure, Pa, without points of zero."""
+"""Raster point (i along x, j along z) -> pressure, Pa. Points without pressure are omitted."""
 
 
 def raster_of(stored: Mapping[str, float]) -> Raster:
@@ -134,7 +134,7 @@ ONE_THREAD = dict.fromkeys(
 
 @contextmanager
 def environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Set environment variables inside a `with` block, also for processes started in it."""
+    """Set environment variables inside a `with` block. Processes started in it inherit them."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:

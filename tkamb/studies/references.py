@@ -325,9 +325,8 @@ TOLERANCES: dict[str, tuple[float, float]] = {
     "bed": (0.01, 0.06),
     "hertz": (0.01, 0.01),
 }
-"""Largest relative errors of approach and pressure. For plates a few times the solver's tolerance,
-otherwise 1.5 times the measured discretisation error.
-"""
+"""Largest relative errors of approach and pressure. For plates they are a few times the solver's
+tolerance, otherwise 1.5 times the measured discretisation error."""
 
 
 @dataclass(frozen=True)
@@ -390,7 +389,7 @@ class ClosedForm:
 
 
 def press_closed_form(case: ClosedForm) -> tuple[ContactResult, ContactPair]:
-    """Press a case; a "kept" case first stores the operator of another modulus in its cache.
+    """Press a case. A "kept" case first stores the operator of another modulus in its cache.
 
     Raises:
         ComputationError: the cache does not contain one operator for each modulus.

@@ -167,7 +167,7 @@ def _relative_error(extreme: SceneExtreme, results: "Results", folder: Path) -> 
 
 
 def _add_noise(folder: Path, noise: float) -> None:
-    """Add noise of a standard deviation in mm and deg to the knee's coordinates."""
+    """Add noise to the knee's coordinates. `noise` is the standard deviation in mm and deg."""
 
     def with_noise(head: list[str], rows: Array) -> Array:
         rng = np.random.default_rng(160)

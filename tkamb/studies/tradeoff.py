@@ -80,7 +80,7 @@ class Row:
         return max(self.floor, *(self.errors[key] for key in FRONT_ERRORS))
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the row as in `tkamb tradeoff --json`; missing numbers are None."""
+        """Return the row as in `tkamb tradeoff --json`. Missing numbers are None."""
         measure = self.measure
         row: dict[str, Any] = {
             "case": self.job.case,
@@ -149,7 +149,7 @@ def beats(first: tuple[float, float], second: tuple[float, float]) -> bool:
     """Return whether the first point (seconds, error) beats the second.
 
     It is faster and at least as accurate, or more accurate and not slower. Times within
-    `EQUAL_RATIO` are equal.
+    `EQUAL_RATIO` count as equal.
     """
     faster = first[0] * EQUAL_RATIO < second[0]
     not_slower = first[0] <= second[0] * EQUAL_RATIO
@@ -172,11 +172,12 @@ def read_rows(path: Path) -> list[Row]:
 QUICK_CASES = ("sphere", "two condyles")
 QUICK_MODELS = ("hertz", "foundation", "lattice", "lattice-linear", "fe")
 ONE_OF_EACH = ("sphere", "two condyles", "conforming", "knee 60 deg", "scene 60 deg")
-"""Cases on which the fine grids are measured; the others have the same bodies at another pose."""
+"""Cases on which the fine grids are measured. The other cases have the same bodies at another
+pose."""
 TRIED_ON = ("two condyles", "conforming", "knee 60 deg")
 """Cases on which the options of the models are varied."""
 PEER_GRIDS_MM: dict[str, tuple[float, ...]] = {"sphere": (2.0,), "two condyles": (2.0, 1.0)}
-"""Case -> cell sizes for CalculiX, mm; the two condyles take minutes at 1 mm."""
+"""Case -> cell sizes for CalculiX, mm. The two condyles take minutes at 1 mm."""
 
 
 @dataclass(frozen=True)

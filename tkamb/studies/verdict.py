@@ -111,7 +111,7 @@ def stored_answers(path: Path = PEER_ANSWERS) -> Mapping[str, tuple[str, Quantit
 
 
 def peer_distances(extreme: Extreme, result: ContactResult) -> dict[str, float]:
-    """Return the relative differences from CalculiX's stored result, if there is one."""
+    """Return the relative differences from CalculiX's stored result; empty if there is none."""
     if extreme.model not in PEER_MODELS or extreme.label not in stored_answers():
         return {}
     stored_hash, peer = stored_answers()[extreme.label]
@@ -283,7 +283,7 @@ def _model(extreme: Extreme, **options: Any) -> ContactModel:
 
 
 def _reference(extreme: Extreme, state: Any, result: ContactResult) -> ContactResult:
-    """Return the result by full Newton, or by the generic search for the load."""
+    """Return the result of another method: full Newton, or the generic search for the load."""
     fields = getattr(contact_class(extreme.model), "__dataclass_fields__", {})
     if "newton" not in fields:
         searched = press_by_search(_model(extreme), state, extreme.load_N, extreme.pose)

@@ -27,6 +27,7 @@ class ContactForces:
         gap: gamma, m, (n,), >= 0.
         approach: D, m.
         active: mask of the nodes in contact, (n,).
+        converged: whether the active set has stopped changing.
     """
 
     force: Array
@@ -50,6 +51,7 @@ def solve_contact(
     Args:
         compliance: A, m/N, (n, n).
         gap: gaps at zero force and approach, m, (n,).
+        normal_y: c, y of the femoral normals, (n,), negative.
         load: force along -y, N; None if the approach is given.
         active: initial guess of the nodes in contact, (n,).
         approach: m, used if the load is None.

@@ -30,8 +30,8 @@ _ROOT = (_VECTORS * np.sqrt(np.maximum(_VALUES, 0))).T[_VALUES > 1e-12]
 class BbarHexahedra(Solid):
     """Mean-dilatation hexahedra, small strain, J2 deformation theory at the Gauss points.
 
-    At each point e² = (2/3) dev eps : dev eps and 3 mu_s = q(e)/e (see `ShearCurve`). The bulk is
-    elastic, and `Solid` has the arguments.
+    At each point e² = (2/3) dev eps : dev eps and 3 mu_s = q(e)/e. The bulk is elastic.
+    `Solid` has the arguments, `ShearCurve` q.
     """
 
     def __init__(self, nodes: Array, cells: Index, spacing: Array, material: Material) -> None:
@@ -99,5 +99,5 @@ class BbarHexahedra(Solid):
         return strain, np.sqrt(np.einsum("cgr,cgr->cg", strain, strain) / 3)
 
     def _per_cell_forces(self, stress: Array, chosen: Index | None) -> Array:
-        """Return (k, 24) from R eps times modulus and weight (k, 8, 5)."""
+        """Return nodal forces (k, 24) from R eps times modulus and weight (k, 8, 5)."""
         return np.einsum("cgrj,cgr->cj", elements_of(self.shear, chosen), stress)

@@ -50,7 +50,7 @@ from tkamb.geometry.frames import Array, Index, Mask
 from tkamb.units import MILLIMETRE
 
 LEAST_OVERLAP = 1e-13
-"""m: smaller overlaps count as no contact: with 1e7 N/m their force is below 1e-6 N."""
+"""m: smaller overlaps count as no contact. With 1e7 N/m their force is below 1e-6 N."""
 COARSE = 1e-3
 """1: from this `tolerance` on the factor is stored in 16-bit integers.
 `LatticeSolverSettings.force_tolerance` states their rounding residual."""
@@ -311,12 +311,11 @@ class CellContact(ContactModel):
 
 @dataclass(frozen=True)
 class CalibratedLattice(CellContact):
-    """The calibrated lattice, which passes the patch test for any Poisson's ratio
-    (docs/lattice.md).
+    """The calibrated lattice. It passes the patch test, for any Poisson's ratio.
 
     A cell has 28 springs, which it shares with its neighbours, and a volume term. The material's
     curve gives one secant shear modulus per cell (J2 deformation theory, elastic bulk, small
-    strain).
+    strain). See docs/lattice.md.
     """
 
     name: ClassVar[str] = "lattice"
@@ -349,7 +348,7 @@ class LinearLattice(CellContact):
 class FiniteElements(CellContact):
     """B-bar hexahedra (mean dilatation), J2 deformation theory at eight Gauss points.
 
-    Grid, contact and pressure rules are those of the lattice, with small strain.
+    Grid, contact and pressure rules are those of the lattice. Small strain.
     """
 
     name: ClassVar[str] = "fe"

@@ -85,7 +85,7 @@ class Residual:
 
 
 class LinearBalance:
-    """The balance of a linear material. It needs no loads h: passes repeat rays and contact.
+    """The balance of a linear material. It needs no loads h; passes repeat rays and contact.
 
     Attributes:
         offset: displacement of the candidates without contact forces, m, (m, 3).
@@ -141,6 +141,7 @@ class NonlinearBalance:
             self.h, self.half = guess.loads, guess.half
 
     def _set_loads(self, h: Array) -> None:
+        """Set h (n, 3), N, on the nodes of the region, and 0 elsewhere."""
         self.h, nodes = np.zeros_like(h), self._region.nodes
         self.h[nodes] = h[nodes]
         self.half = self._problem.operator.start(self.h, self._region.fronts)
@@ -154,6 +155,7 @@ class NonlinearBalance:
         """Compute the region's displacement and residual.
 
         Args:
+            force: forces on the candidates, N, (m, 3).
             displacement: candidates' displacement from the condensed compliance, m, (m, 3).
         """
         operator, region, solid = self._problem.operator, self._region, self._problem.solid
@@ -197,6 +199,7 @@ class NonlinearBalance:
         self.displacement = measured
 
     def _set_residual(self, r: Array) -> None:
+        """Set the residual from the residual nodal forces (n, 3), N."""
         for loads in (r, self.loads):
             loads.ravel()[self._problem.held_unknowns] = 0.0
         last, self._size = self.residual, float(np.linalg.norm(self._force))
@@ -262,7 +265,7 @@ def forces_of(solid: Solid, field: Array) -> tuple[Array, Array, float]:
 def accelerated(iterates: list[tuple[Array, Array]]) -> Array:
     """Return the next x of a fixed-point iteration x = g(x), by Anderson's method.
 
-    It combines the iterates so that the linearised residual is smallest.
+    The method combines the iterates so that the linearised residual is smallest.
 
     Args:
         iterates: pairs of g(x) and g(x) - x, (n,) each, the newest last.

@@ -112,7 +112,7 @@ class ContactProblem:
 class TangentPlanes:
     """The tangent planes of the femoral surface over contact nodes, at zero approach.
 
-    Points and outward unit normals (m, 3), m, are on the verticals through the nodes.
+    Points and outward unit normals (m, 3), m, lie on the verticals through the nodes.
     """
 
     points: Array

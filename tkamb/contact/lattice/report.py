@@ -163,6 +163,7 @@ def result_of(
     """Return the result of a solution.
 
     Args:
+        pose: pose at approach 0 of the solution, (4, 4).
         load: N, or None if the pose was given.
         gaps: vertical gaps at that pose, m, (c,).
         rule: rule for the area that a nodal force acts on.

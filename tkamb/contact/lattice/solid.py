@@ -127,6 +127,7 @@ class Pattern:
 
 @compiled
 def _add_blocks(matrices: Array, slot: Index, blocks: Array) -> None:
+    """Add the (3, 3) blocks of matrices (k, 3p, 3p) to the blocks at `slot` (k, p²)."""
     count = matrices.shape[1] // 3
     for k in range(len(matrices)):
         for i in range(count):
@@ -165,6 +166,7 @@ def elements_of(elements: NDArray[Any], chosen: Index | None) -> NDArray[Any]:
 
 @compiled
 def _add_up(parts: Array, elements: Index, chosen: Index, total: Array) -> None:
+    """Add vectors (k, p, 3) of the chosen elements (k,) to nodal vectors (n, 3)."""
     for k in range(len(chosen)):
         element = chosen[k]
         for corner in range(parts.shape[1]):
@@ -245,7 +247,7 @@ class Solid(ABC):
     def forces(self, displacement: Array) -> tuple[Array, Array, float]:
         """Return the internal forces of a displacement (n, 3), m, summed element by element.
 
-        The stored factor is not used: its rounding would hide the error of a solution.
+        They do not use the stored factor, whose rounding would hide the error of a solution.
 
         Returns:
             Internal forces f(u) (n, 3), N; norm of h = K u - f(u) of each element (k,), N; and

@@ -24,8 +24,8 @@ and the active set has stopped changing. The second residual estimates the relat
 approach, because an error du = e u leaves r = e K_T u. The load and lambda >= 0 hold to rounding in
 every pass.
 
-Else an iteration that began with the loads of an earlier solution begins again without them, or
-`solve_by_newton` continues (also the reference).
+Else an iteration that began with the loads of an earlier solution begins again without them.
+Otherwise `solve_by_newton` continues, which is also the reference.
 """
 
 from dataclasses import dataclass, replace
@@ -75,7 +75,7 @@ class Solution:
 
     @property
     def converged(self) -> bool:
-        """Whether all residuals are within their tolerances, with an unchanged active set."""
+        """Whether the residual is within its tolerances and the active set stopped changing."""
         return self.forces.converged
 
 
@@ -153,9 +153,9 @@ class SlidingNodes:
     """The femoral planes over the candidates, updated as the nodes slide.
 
     Each pass solves the contact on tangent planes, then new rays through the displaced nodes give
-    the next ones. Where the femoral normal turns quickly (a rim, a coarse triangle) the nodes can
-    oscillate. The rays then follow them only part of the way. Points and displacement (m, 3), m,
-    are those of the undeformed candidates.
+    the next ones. The nodes can oscillate where the femoral normal turns quickly (a rim, a coarse
+    triangle); then the rays follow the nodes only part of the way. Points and displacement (m, 3),
+    m, are those of the undeformed candidates.
     """
 
     def __init__(

@@ -144,7 +144,7 @@ class HeldNodes:
         return np.where(self.held, 0.0, values.ravel())
 
     def _solve_linear(self, force: Array) -> Array:
-        """Return P f (n, 3), m."""
+        """Return P f (n, 3), m, of a force f (n, 3), N."""
         y = self._operator.start(force)
         if len(self._chosen):
             projection = self._response.half.project(y)[self._chosen]
@@ -268,7 +268,7 @@ def solve_by_loops(
 ) -> Solution:
     """Return the result of `solver.solve` by Sharma's loops.
 
-    The problem's `direction` is "vertical"; of the guess, only candidates, planes and reach are
+    The problem's `direction` is "vertical". Of the guess, only candidates, planes and reach are
     used.
     """
     nodes = problem.contact_nodes[guess.candidates]

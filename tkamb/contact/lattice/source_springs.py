@@ -109,7 +109,7 @@ class SourceNetwork(Solid):
     def tangent(self, displacement: Array) -> sparse.csr_matrix:
         """Return the sum of (d sigma/d eps) C n nᵀ of the springs, N/m, (3n, 3n).
 
-        It neglects that loaded springs turn, as in Sharma (2008).
+        As in Sharma (2008), it neglects that loaded springs turn.
         """
         if self.material.is_linear:
             return self.stiffness

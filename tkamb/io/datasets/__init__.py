@@ -89,7 +89,7 @@ class Got:
     """Result of fetching a data set.
 
     Args:
-    absent: names of files that fetching did not find.
+        absent: names of files that were not found.
     """
 
     kept: list[str] = field(default_factory=list)
@@ -101,6 +101,7 @@ def download(dataset: Dataset, to: Path, url: str | None = None) -> Got:
     """Download the missing files of a data set.
 
     Args:
+        to: its folder; it is made if it does not exist.
         url: address of a mirror with the same paths; None: the data set's own address.
 
     Returns:

@@ -23,12 +23,16 @@ class Leg:
     """A leg of a model.
 
     Args:
+        side: "right" or "left".
+        knee: the femorotibial joint.
         flexion: name of the knee's flexion coordinate; None if the knee has no rotation coordinate.
-        ankle: joint below the tibia, as `hip` above the femur.
-        femur: names of the femur and of the bodies welded to it, the femur first, like `tibia`.
+        ankle: the joint below the tibia.
+        hip: the joint above the femur.
+        femur: names of the femur and of the bodies welded to it, the femur first.
+        tibia: names of the tibia and of the bodies welded to it, the tibia first.
         patella: name of the patella; None if the model has no patella.
-        neutral: body -> (4, 4) pose in ground at zero knee flexion, with default values of all
-            other coordinates.
+        neutral: body -> (4, 4) pose in ground in the neutral position. There the knee flexion is
+            zero, and all other coordinates have their default values.
     """
 
     model: OpenSimModel

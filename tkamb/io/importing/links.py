@@ -35,7 +35,7 @@ class MeshFrame:
 
     Args:
         pose: pose_mesh_in_body, (4, 4); None: at the body's origin, with anatomical axes.
-        why: words on how the frame was identified, for the report.
+        why: words for the report on how the frame was identified.
     """
 
     body: str
@@ -132,7 +132,7 @@ class Links:
         raise InputError(f"body '{body}' is not part of any link of the leg", leg.model.name)
 
     def point_in_link(self, body: str, point: Array) -> tuple[str, Array]:
-        """Return the link that moves with a body, and a point (3,), m, in it."""
+        """Return the link that moves with a body, and the coordinates (3,) m of a point in it."""
         link, offset = self.body_in_link(body)
         return link, transform(offset, point)
 

@@ -40,7 +40,7 @@ class ModelSegment:
 def model_segments(
     links: Links, recorded: Table, without: Sequence[str] = ()
 ) -> list[ModelSegment]:
-    """Return shank and thigh, and possibly foot and pelvis, with at least three markers."""
+    """Return the segments with at least three markers: shank, thigh, and possibly foot, pelvis."""
     result = seen_segments(links, recorded, without)
     for name in ("shank", "thigh"):
         segment = result[name]
@@ -135,7 +135,7 @@ def _seen_labels(recorded: Table, without: Sequence[str]) -> tuple[list[str], li
 
 
 def segments_of(recorded: Table, segments: list[ModelSegment]) -> list[ModelSegment]:
-    """Return the segments with another recording's labels, without those that it lacks."""
+    """Return the segments with another recording's labels, without markers that it lacks."""
     labels = recorded_labels(recorded)
     result = []
     for segment in segments:

@@ -145,7 +145,7 @@ class ModelChain:
         )
 
     def _symmetric(self, matrix: Array) -> Array:
-        """Return the symmetric matrix (f, n, n), of which only i before j is read."""
+        """Return the symmetric matrix (f, n, n). Only entries with i before j are read."""
         upper = matrix * self._above
         return np.asarray(upper + upper.swapaxes(1, 2))
 
@@ -258,7 +258,7 @@ def fit_model(
 def fit_in_blocks(
     chain: ModelChain, measured: Array, weights: Array, start: Array
 ) -> ChainFit[Array]:
-    """Return the fit of many frames, in blocks of `block_frames`."""
+    """Return the fit of many frames, computed in blocks of `block_frames`."""
     parts = [slice(k, k + BLOCK_FRAMES) for k in range(0, len(measured), BLOCK_FRAMES)]
     fits = [fit_chain(chain, measured[part], weights, start[part]) for part in parts]
     state, rms, distance, solved = (

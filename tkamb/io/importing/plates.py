@@ -180,8 +180,8 @@ class RecordedForce:
 
     Args:
         key: number of the plate, or name of the table's force.
-        wrench: force (N) and moment (N·m) about the laboratory's origin, (k, 6), at the times
-            `time` (k,), s.
+        time: times, s, (k,).
+        wrench: force (N) and moment (N·m) about the laboratory's origin, (k, 6).
         level: height of the plate's surface, m.
         drift: vertical force that the unloaded plate reads, N.
     """
@@ -229,6 +229,7 @@ class Load:
         plate: number of the plate, or name of the table's force.
         side: "left" or "right" foot; "": no foot's markers are near.
         start: time of the load's first sample, s.
+        end: time of the load's last sample, s.
         distance: median distance from the centre of pressure to the nearest foot's markers, m.
         other: median distance to the other foot's markers, m; NaN without such markers.
         surface: approximate height of the step under the foot above the plate, m; 0: no step.

@@ -89,7 +89,7 @@ def model_motion(links: Links, recorded: Table) -> ModelMotion:
     """Return the motion of knee and shank from coordinates of the model.
 
     Args:
-        recorded: columns have a coordinate's name or path in the model.
+        recorded: table whose columns have a coordinate's name or path in the model.
     """
     leg = links.leg
     kinematics = Kinematics(leg.model)
@@ -311,6 +311,7 @@ def read_poses(
         insert: mesh of the insert about its own origin, in anatomical axes.
         axes: axes of the meshes that point anterior, superior and right.
         cutoff_Hz: cut-off frequency of the scene's low-pass filter, Hz.
+        interval: start and end of the part to compute, s; None: the whole recording.
     """
     turn = pose(axes_rotation(axes), np.zeros(3))
     placement = insert_placement(insert, axes_rotation(axes)) @ turn

@@ -46,9 +46,8 @@ class RegistrationSettings:
     (tests/test_registration.py).
     """
     marker: float = 15.0 * MILLIMETRE
-    """m: scale τ of a marker's distance from the model's position, by direction. Not studied: hands
-    place markers to about this accuracy.
-    """
+    """m: scale τ of a marker's distance from the model's position in each direction. Not studied:
+    hands place markers to about this accuracy."""
     marker_freedom: float = 4.0
     """Degrees of freedom of Student's t of that distance. Single markers lie much
     farther away: of subject DM one by 80 mm."""
@@ -75,9 +74,9 @@ class RegistrationSettings:
     a segment together. Shank and thigh as in `SKIN_MARKER_ERROR`; foot and pelvis are
     assumptions."""
     noise_rounds: int = 6
-    """Number of estimates of σ. The fourth changes σ by less than 2 %."""
+    """Number of estimates of σ. The fourth changes it by less than 2 %."""
     tolerance: float = 1e-6
-    """m and rad: the search ends after a smaller step. It is far below the noise of markers."""
+    """m and rad: the search ends after a smaller step. Far below the noise of markers."""
     max_iterations: int = 60
     """Largest number of steps per estimate of σ. Searches that converge need fewer than 20."""
 
@@ -103,6 +102,7 @@ class Registration:
         noise: label -> its deviation σ about the fitted leg, m.
         joints: "hip" or "ankle" -> its shift in thigh or shank and the deviation, m, (3,) each.
         offset: mean offset of AP, SI, ML (m), axial rotation and adduction (rad), (5,).
+        offset_deviation: its deviation, (5,).
         knee_distance: median distance of the knee centres of shank and thigh before and after, m.
         knee_centre: deviation of the knee's centre, as the shank's markers place it, in the axes
             of the shank, m, (3,).
@@ -210,7 +210,7 @@ def misfit(
 
 
 def knee_distance(links: Links, fits: dict[str, tuple[Array, dict[str, float]]]) -> float:
-    """Return the median distance (m) of the knee centres by shank and thigh markers."""
+    """Return the median distance (m) of the knee centres that shank and thigh markers give."""
     knee = inverse(fits["shank"][0] @ links.insert_in_tibia) @ fits["thigh"][0]
     return float(np.nanmedian(np.linalg.norm(knee[:, :3, 3] - links.neutral[:3], axis=1)))
 
@@ -304,7 +304,7 @@ class _MarkedLeg:
         return q
 
     def at_state(self, q: Array, theta: Array) -> tuple[Array, Array, Array]:
-        """Return marker positions (f, m, 3), Jacobians (f, m, 3, nv), rotations (f, s, 3, 3)."""
+        """Return marker positions (f, m, 3), Jacobians (f, m, 3, nv) and rotations (f, s, 3, 3)."""
         for ball, part in self.joint_parts:
             assert ball.joint is not None
             joint = self.model.jointPlacements[self.joints[ball.name]]
@@ -339,7 +339,7 @@ class _MarkedLeg:
 
 
 def _chosen_frames(leg: _MarkedLeg, trials: dict[str, dict[str, Array]]) -> dict[str, Array]:
-    """Return segment -> markers (f, m, 3) of the frames with shank and thigh visible."""
+    """Return segment -> measured markers (f, m, 3) of the frames with shank and thigh visible."""
     chosen: dict[str, list[Array]] = {s.name: [] for s in leg.segments}
     for markers in trials.values():
         seen = [np.isfinite(markers[n]).all(axis=2).sum(axis=1) >= 3 for n in ("shank", "thigh")]
@@ -358,7 +358,7 @@ def _chosen_frames(leg: _MarkedLeg, trials: dict[str, dict[str, Array]]) -> dict
 def _rigid(
     segments: Sequence[ModelSegment], measured: dict[str, Array]
 ) -> dict[str, tuple[Array, dict[str, float]]]:
-    """Return segment -> fits (f, 4, 4), and label -> root mean square residual, m."""
+    """Return segment -> rigid fits (f, 4, 4), and label -> root mean square residual, m."""
     result = {}
     for s in segments:
         points = np.array(list(s.points.values()))
@@ -435,7 +435,7 @@ def _equations(
 def _noise(leg: _MarkedLeg, q: Array, theta: Array, target: Array) -> Array:
     """Return σ (m,) m of each marker in each direction, from its residuals.
 
-    The poses adapt to the markers, so the residuals have too few degrees of freedom.
+    The poses adapt to the markers, so that residuals have too few degrees of freedom.
     """
     x, _, _ = leg.at_state(q, theta)
     square = np.nanmean((target - x) ** 2, axis=(0, 2))

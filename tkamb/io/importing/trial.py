@@ -58,7 +58,11 @@ from tkamb.units import DEGREE, MILLIMETRE
 def with_static_markers(
     scene: SceneText, static: Path, segments: list[ModelSegment], length_unit: str | None = None
 ) -> tuple[SceneText, list[str]]:
-    """Return the scene with marker positions from a standing trial, and remarks on them."""
+    """Return the scene with marker positions from a standing trial, and remarks on them.
+
+    Args:
+        length_unit: unit of lengths in the trial; None: the unit that the file states.
+    """
     assert scene.markers is not None
     marker_table = Scene.model_validate(tomllib.loads(scene.text())).motion.markers
     assert marker_table is not None
@@ -403,7 +407,7 @@ def moved_markers(
 
 
 def _distances(points: Array) -> Array:
-    """Return median distances (m, m) of markers (n, m, 3), m; NaN if never seen together."""
+    """Return the median distances (m, m) of markers (n, m, 3), m; NaN if never seen together."""
     apart = np.linalg.norm(points[:, :, None] - points[:, None], axis=3)
     seen = np.isfinite(apart).any(axis=0)
     result = np.full(seen.shape, np.nan)

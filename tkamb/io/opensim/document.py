@@ -212,7 +212,7 @@ MAX_NESTED_FILES = 5
 
 
 NOT_NEEDED = ("ControllerSet", "ProbeSet", "ContactGeometrySet", "AnalysisSet")
-"""Sets that tkamb does not model; their files may be absent."""
+"""Sets that tkamb does not model. Their files may be absent."""
 
 _BARE_AMPERSAND = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#[0-9]+|#x[0-9a-fA-F]+);)")
 _COMMENT = re.compile(r"<!--(.*?)-->", re.S)

@@ -106,7 +106,7 @@ class Kinematics:
         self._signed_gradients = self._signs[:, None] * self._gradients
 
     def vector(self, q: Mapping[str, float] | ArrayLike) -> Array:
-        """Return coordinates (..., n), with default values for those not in a mapping."""
+        """Return coordinates (..., n). Those that are not in a mapping have default values."""
         if isinstance(q, Mapping):
             values = np.array([c.default for c in self.model.coordinates.values()])
             for name, value in q.items():
@@ -122,7 +122,7 @@ class Kinematics:
         return values
 
     def coupled(self, q: Mapping[str, float] | ArrayLike) -> Array:
-        """Return the coordinates (..., n) with dependent ones by their couplers."""
+        """Return the coordinates (..., n) with dependent ones set by their couplers."""
         values = self.vector(q).copy()
         for coupler in self.model.couplers:
             independent = values[..., self.coordinates[coupler.independent]]
@@ -132,7 +132,7 @@ class Kinematics:
     def coupling(self, q: ArrayLike) -> Array:
         """Return the derivatives (..., n, n) of all coordinates (rows) by the independent ones.
 
-        A dependent coordinate has a column of zeros.
+        The column of a dependent coordinate is zero.
         """
         values = self.vector(q)
         result = np.broadcast_to(np.eye(values.shape[-1]), (*values.shape, values.shape[-1])).copy()
@@ -164,7 +164,10 @@ class Kinematics:
         return Motion(self.bodies, poses, twists, axis_twists)
 
     def joint_twists(self, q: Array) -> tuple[Array, Array]:
-        """Return the poses of all bodies, and the twist of each coordinate of q (..., n).
+        """Return the poses of all bodies, and the twist that each coordinate gives to bodies.
+
+        Args:
+            q: coordinates, rad and m, (..., n).
 
         Returns:
             Poses in ground (..., b, 4, 4). Twists (..., n, 6) at ground's origin, per unit of each

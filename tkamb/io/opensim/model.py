@@ -134,7 +134,7 @@ def simm_spline(x: Array, y: Array) -> Piecewise:
 
     The third derivative in the first interval is that of the cubic through the first four points.
     The last interval uses the last four points. With three points the third derivative is zero;
-    with two points the spline is a straight line. It is not a natural spline.
+    with two points the spline is a straight line. The spline is not a natural spline.
     """
     if len(x) == 2:
         return piecewise_linear(x, y)

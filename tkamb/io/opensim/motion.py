@@ -62,6 +62,11 @@ def required_wrenches(
     A wrench is the moment (N·m) above the force (N), in ground at ground's origin; it is zero for
     ground. The sum over the bodies outboard of a joint is the wrench that muscles, ligaments and
     the joint exert on them.
+
+    Args:
+        q: coordinates, rad and m, (f, n).
+        rates: first time derivatives of the coordinates, (f, n).
+        accelerations: second time derivatives of the coordinates, (f, n).
     """
     twists = np.einsum("fbin,fn->fbi", motion.twists, rates)
     result = np.zeros_like(twists)
@@ -86,7 +91,7 @@ def required_wrenches(
 def _accelerations(
     kinematics: Kinematics, motion: Motion, twists: Array, q: Array, rates: Array, second: Array
 ) -> Array:
-    """Return the rate (f, b, 6) of each body's twist."""
+    """Return the time derivative (f, b, 6) of each body's twist."""
     result = np.zeros_like(twists)
     speeds, axis_accelerations = kinematics.axis_rates(q, rates, second)
     first = 0
@@ -204,7 +209,11 @@ def _angle_scale(angles: dict[str, Array], recorded: Table) -> float:
 
 
 def angle_lines(kinematics: Kinematics, recorded: Table, q: Array) -> tuple[str, ...]:
-    """Return a remark if the angles are too small for their stated unit."""
+    """Return a remark if the angles are too small for their stated unit.
+
+    Args:
+        q: coordinates from the table, rad and m, (f, n).
+    """
     coordinates = kinematics.model.coordinates
     angles = [kinematics.coordinates[name] for name in coordinates if coordinates[name].rotational]
     turns = np.ptp(q[:, angles], axis=0) / DEGREE

@@ -105,6 +105,7 @@ class LineSet:
         """Return lengths, moment arms, wrenches on groups of bodies, and crossings between groups.
 
         Args:
+            q: coordinates, rad and m, (..., n).
             groups: names of the bodies in each of the g groups.
         """
         q = self.kinematics.vector(q)
@@ -126,7 +127,7 @@ class LineSet:
         return Pulls(self.names, length, arm, wrench, StraightParts.joined(parts))
 
     def _chunks(self, q: Array) -> Iterator[tuple[int, Array]]:
-        """Yield, by block of frames, the index of the first one and coordinates (f, n)."""
+        """Yield, for each block of frames, the index of its first frame and coordinates (f, n)."""
         flat = q.reshape(-1, q.shape[-1])
         for first in range(0, len(flat), BLOCK_FRAMES):
             yield first, flat[first : first + BLOCK_FRAMES]
@@ -215,7 +216,7 @@ class LineSet:
         motion: Motion,
         work: Tension,
     ) -> None:
-        """Add strings from point k to `next_point` in frames `rows`, over the wraps."""
+        """Add strings from point k to points `next_point` in frames `rows`, over the wraps."""
         objects = self.kinematics.model.wrap_objects
         usable = [w for w in path.wraps if first + w.first <= k and objects[w.wrap_object].active]
         wraps = [objects[w.wrap_object] for w in usable]

@@ -38,9 +38,8 @@ UNITS = {
 }
 """Tag of a unit -> accepted spellings of metre and newton."""
 NO_UNIT = ("unassigned", "unknown")
-"""Words for a unit that OpenSim writes when it does not know the unit. It then computes in metres
-and newtons, as always.
-"""
+"""Words for a unit that OpenSim writes when it does not know the unit. OpenSim then computes in
+metres and newtons, as always."""
 
 
 # Oldest version of a file that is read, from OpenSim 2.3.2. Older files use other names.
@@ -117,8 +116,8 @@ def read_osim(path: str | Path, partial: bool = False) -> OpenSimModel:
 def _upright(gravity: Array, notices: list[str]) -> tuple[Array, str | None]:
     """Return the rotation (3, 3) of the file's ground to one whose y points up, and its axes.
 
-    It is the smallest one; the axes are `OpenSimModel.ground_axes`. `notices` gets a line if
-    gravity is not along -y.
+    It is the smallest such rotation. The axes are those of `OpenSimModel.ground_axes`. `notices`
+    gets a line if gravity is not that of a ground with y up.
     """
     size = float(np.linalg.norm(gravity))
     if size == 0.0:
@@ -185,7 +184,7 @@ def _concerns(
 def _opened(
     root: Element, path: Path, partial: bool, notices: list[str]
 ) -> tuple[Document, Element]:
-    """Return the document and its <Model>; `notices` gets a line for each unit without a name."""
+    """Return the document and its <Model>. `notices` gets a line for each unit without a name."""
     model = root.find("Model")
     if root.tag != "OpenSimDocument" or model is None:
         raise InputError(

@@ -59,7 +59,7 @@ class Frames:
     def of(
         cls, document: Document, model: Element, bodies: Iterable[str], upright: Array
     ) -> "Frames":
-        """Return the frames of a model, with the rotation `upright` (3, 3) of its ground."""
+        """Return the frames of a model. `upright` turns the file's ground, (3, 3)."""
         offsets: dict[tuple[str, str], tuple[str, Array]] = {}
         stations = _stations(document, model)
         unread: dict[str, str] = {}
@@ -224,7 +224,7 @@ def _joint_elements(document: Document, model: Element) -> Iterator[tuple[Elemen
 def _joint_frames(
     document: Document, element: Element, frames: Frames, child: str | None
 ) -> tuple[tuple[str, Array], tuple[str, Array]]:
-    """Return body, and pose (4, 4) of the joint's frame in it, of parent and child."""
+    """Return, for parent and child, the body and the pose (4, 4) of the joint's frame in it."""
     if child is None:
         name = document.name(element)
         sockets = (document.socket(element, f"{end}_frame") for end in ("parent", "child"))

@@ -35,7 +35,7 @@ MUSCLES = (
     "DeGrooteFregly2016Muscle",
     "RigidTendonMuscle",
 )
-"""Supported classes of muscles, which share the parameters that tkamb reads."""
+"""Supported classes of muscles. They share the parameters that tkamb reads."""
 
 SHAPES: dict[str, tuple[Shape, tuple[str, ...]]] = {
     "WrapCylinder": ("cylinder", ("radius", "length")),

@@ -24,7 +24,7 @@ from tkamb.errors import InputError
 from tkamb.geometry.frames import Array
 
 BLOCK = 512
-"""Bytes of a block, in which the format counts positions."""
+"""Bytes of a block. The format counts positions in blocks."""
 LARGEST_16_BIT = 65535
 """Largest frame number of the header; longer recordings state theirs in TRIAL."""
 EXPORT = "export the trial again as C3D"

@@ -129,14 +129,14 @@ def differentiate_poses(
 
 
 def _continuous(quaternions: Array) -> Array:
-    """Return quaternions (n, 4) with signs that make consecutive rows continuous."""
+    """Return the quaternions (n, 4) with signs that make consecutive rows continuous."""
     turns = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
     signs = np.cumprod(np.where(np.concatenate([[False], turns]), -1.0, 1.0))
     return np.asarray(quaternions * signs[:, None])
 
 
 def _relative_vector(s: Array, r: Array) -> Array:
-    """Return the vector part (f, 3) of conj(s) r, scalar last."""
+    """Return the vector part of conj(s) r for quaternions (f, 4), scalar last."""
     sv, sw, rv, rw = s[:, :3], s[:, 3:], r[:, :3], r[:, 3:]
     return np.asarray(sw * rv - rw * sv - np.cross(sv, rv))
 

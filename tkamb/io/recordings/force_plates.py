@@ -78,7 +78,7 @@ class PressureRange:
 
     @property
     def resting(self) -> bool:
-        """Whether the centre of pressure stays at the transducers' origin."""
+        """Whether the centre of pressure rests at the transducers' origin."""
         return bool((self.origin < RESTING).all())
 
     @property
@@ -110,7 +110,7 @@ def pressure_range(
 
 
 def other_units(stated_m: float) -> Iterator[tuple[tuple[str, float], ...]]:
-    """Yield groups of (name, metres) of other units of length than the stated one (m)."""
+    """Yield groups of names and metres of units of length other than the stated one (m)."""
     for names in (USUAL, UNUSUAL):
         units = tuple((name, LENGTH[name]) for name in names)
         yield tuple(unit for unit in units if abs(unit[1] / stated_m - 1.0) > 1e-6)
@@ -285,7 +285,7 @@ def _stated_length(record: PlateRecord) -> float:
 
 
 def _loaded_in_zero(record: PlateRecord, force: Array) -> str:
-    """Return why the mean over the frames of ZERO is not subtracted, or ""."""
+    """Return the reason not to subtract the mean over the frames of ZERO, or ""."""
     assert record.zero is not None
     vertical = force[:, 2]
     window = vertical[record.zero]
@@ -342,13 +342,13 @@ def _read(record: PlateRecord) -> tuple[Array, Array, tuple[str, ...]]:
 
 
 def _on_plate(record: PlateRecord, force: Array, moment: Array) -> bool:
-    """Return whether the centre of pressure is on the plate; true if it is not loaded."""
+    """Return whether the centre of pressure is on the plate, or the plate is not loaded."""
     where = pressure_range(record.corners, force, moment, _above_transducers(record))
     return where is None or where.usual
 
 
 def _wrench(kind: int, s: Array, origin: Array) -> tuple[Array, Array]:
-    """Return force and moment about the surface's centre, (k, 3), in the plate's axes."""
+    """Return force and moment about the surface's centre, each (k, 3), in the plate's axes."""
     if kind == 3:
         a, b = origin[0], origin[1]
         force = np.stack([s[0] + s[1], s[2] + s[3], s[4:8].sum(axis=0)], axis=1)

@@ -166,7 +166,7 @@ def load_ground_reaction(source: GroundReactionTable, time: Array, side: Side) -
 def recorded_wrench(source: GroundReactionTable) -> tuple[Array, Array, float]:
     """Return times (k,) s, wrench on the foot (k, 6) N and N·m, and plate level (m) of a table.
 
-    The wrench is about the laboratory's origin, in its axes.
+    The wrench is in the laboratory's axes, about the laboratory's origin.
     """
     recorded = _read_table(source)
     _check_upward(recorded.force, source)

@@ -116,6 +116,7 @@ def fit_chain(
 
     Args:
         measured: (f, m, 3) m, gaps NaN.
+        weights: (m,) weights of the squared distances.
     """
     visible = np.isfinite(measured).all(axis=2)
     target, frame_weights = np.nan_to_num(measured), np.where(visible, weights, 0.0)
@@ -174,7 +175,7 @@ def _step(equations: NormalEquations, damping: Array, near: NDArray[np.bool_]) -
 
 
 def put(values: Array, frames: Index, part: Array) -> Array:
-    """Return a copy with the values of some frames replaced by `part`."""
+    """Return a copy of `values` with those of some frames replaced by `part`."""
     result = values.copy()
     result[frames] = part
     return result

@@ -30,7 +30,7 @@ LENGTH_WORDS = {
     **dict.fromkeys(("in", "inch", "inches"), LENGTH["inch"]),
     **dict.fromkeys(("ft", "foot", "feet"), 12 * LENGTH["inch"]),
 }
-"""Metres per unit; some programs shorten a word to four letters."""
+"""Metres per unit. Some programs shorten a word to four letters."""
 FORCE_WORDS = {
     **dict.fromkeys(("n", "nt", "newt", "newton", "newtons"), 1.0),
     **dict.fromkeys(("dan", "decanewton", "decanewtons"), 10.0),
@@ -40,7 +40,7 @@ FORCE_WORDS = {
 }
 """Newtons per unit."""
 LENGTH_FIRST = ("in", "inch", "ft", "foot")
-"""Units of length that may precede the force, as in `in-lb`, while `mN` is a millinewton."""
+"""Units of length that may precede the force, as in `in-lb`. `mN` is a millinewton."""
 
 _SEPARATORS = str.maketrans("", "", " .*-·⋅_\x00\t")
 

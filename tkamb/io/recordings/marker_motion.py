@@ -48,7 +48,7 @@ MAX_JOINT_GAP = 0.1
 
 @dataclass(frozen=True, eq=False)
 class MarkerKinematics:
-    """Kinematics of a leg from skin markers, SI; a left leg is mirrored to a right one.
+    """Kinematics of a leg from skin markers, SI. A left leg is mirrored to a right one.
 
     Args:
         time: (n,) s, times of the frames that `method` can fit, without a gap.
@@ -248,7 +248,7 @@ def _compare_readings(
 
 
 def _joint_rms(fits: dict[str, tuple[Array, Array]], measured: dict[str, Array]) -> Array:
-    """Return the root mean square distance (n,) over shank and thigh markers."""
+    """Return the root mean square distance (n,) of shank and thigh markers together."""
     counts = [np.isfinite(measured[name]).all(axis=2).sum(axis=1) for name in KNEE_SEGMENTS]
     squares = [fits[name][1] ** 2 * k for name, k in zip(KNEE_SEGMENTS, counts, strict=True)]
     return np.asarray(np.sqrt(np.sum(squares, axis=0) / np.maximum(np.sum(counts, axis=0), 1)))

@@ -60,7 +60,7 @@ def marker_trajectories(table: Table, names: list[str], metres_per_unit: float) 
 def shank_points(source: TibiaTable, recorded: Table) -> tuple[Array, Array]:
     """Return the shank's markers and joint centres, as measured and in the tibia link's frame.
 
-    A joint centre is by a rigid fit of the neighbouring segment's markers.
+    A joint centre is found by a rigid fit of the neighbouring segment's markers.
 
     Returns:
         Points (n, m, 3), m, in the file's axes, gaps NaN; reference points (m, 3), m.
@@ -125,6 +125,7 @@ def fit_seen(points: Array, reference: Array, weights: Array, name: str) -> tupl
 
     Args:
         points: (n, m, 3) m, gaps NaN.
+        reference: (m, 3) m.
         weights: (m,) weights of the squared distances.
 
     Returns:
@@ -160,7 +161,7 @@ def _spans(reference: Array) -> bool:
 
 
 def _nearest_rotation(h: Array) -> Array:
-    """Return Kabsch's rotations (n, 3, 3) of covariances (n, 3, 3); see `fit_rigid`."""
+    """Return the rotations (n, 3, 3) of Kabsch's covariances (n, 3, 3); see `fit_rigid`."""
     u, _, vt = np.linalg.svd(h)
     v, ut = np.swapaxes(vt, 1, 2), np.swapaxes(u, 1, 2)
     signs = np.ones((len(h), 3))
@@ -184,6 +185,8 @@ def complete_run(
     """Return the longest range of frames around [start, end] in which no marker is missing.
 
     Args:
+        points: (n, m, 3), gaps NaN.
+        time: (n,) s.
         start: start of the interval, s, which lasts to `end`.
     """
     first = int(np.searchsorted(time, start + 1e-9, side="right")) - 1

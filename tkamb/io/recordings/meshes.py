@@ -250,7 +250,7 @@ def body_size(body: Body, unit: float) -> str:
 
 
 def describe_holes(holes: tuple[BoundaryLoop, ...], unit: str) -> str:
-    """Return a text on the widest hole, its centre in file axes and units, and the others."""
+    """Return a text on the widest hole, its centre in file axes and units, and the other holes."""
     widest, more = holes[0], len(holes) - 1
     where = ", ".join(f"{value / LENGTH[unit]:.4g}" for value in widest.centre)
     text = (
@@ -391,7 +391,7 @@ def _check_knee_width(surface: Surface, path: str | Path) -> None:
 
 
 def _check_rounding(corners: Array, unit: str, path: str | Path, name: str) -> None:
-    """Warn or raise for coordinates (n, 3) that are rounded too coarsely."""
+    """Warn, or raise an InputError, if coordinates (n, 3) are rounded too coarsely."""
     rounding = coordinate_rounding(corners) * LENGTH[unit]
     if rounding <= ROUNDING_NOTICE:
         return
@@ -417,6 +417,7 @@ def coordinate_rounding(corners: Array) -> float:
 
 
 def _axis_rounding(values: Array) -> float:
+    """Return the step to which the coordinates (n,) along an axis are rounded; 0: none."""
     largest = float(np.abs(values).max(initial=0.0))
     if largest == 0.0:
         return 0.0

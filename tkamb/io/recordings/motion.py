@@ -64,7 +64,7 @@ fluoroscopy."""
 
 @dataclass(frozen=True, eq=False)
 class KneeMotion:
-    """The knee's motion, SI; a left knee is mirrored to a right one.
+    """The knee's motion, SI. A left knee is mirrored to a right one.
 
     Args:
         time: (f,) s.
@@ -237,7 +237,7 @@ def _turn_signs(recorded: Table, source: MotionTable) -> Table:
 
 
 def _bending_role(recorded: Table, source: MotionTable) -> str:
-    """Return the role that shows flexion; in a pose the rotation with the largest range."""
+    """Return the role that shows flexion; for a pose, the rotation with the largest range."""
     if source.interpretation != "pose":
         return "flexion"
 
@@ -274,7 +274,7 @@ def _check_patella(patella: Array, path: Path) -> None:
 
 
 def _find_odd_steps(time: Array, values: Array, path: Path) -> tuple[OddSample, ...]:
-    """Return the odd samples (n, 6 or 9), and raise if a coordinate changes too fast."""
+    """Return the odd samples of coordinates (n, 6 or 9). Raise if a coordinate changes too fast."""
     odd: list[OddSample] = []
     for i, name in enumerate((*KNEE_COORDINATES, *PATELLA_COORDINATES)[: values.shape[1]]):
         moves = name.rsplit("_")[-1] in ("ap", "si", "ml")

@@ -487,7 +487,7 @@ class _PolyData:
         return self._decoded(source, size + length, raw)[0][size:]
 
     def _decoded(self, source: bytes, count: int, raw: bool) -> tuple[bytes, bytes]:
-        """Return the first `count` bytes of a raw or base64 text, and the rest."""
+        """Return the first `count` bytes of a raw or base64 text, and the remaining text."""
         length = count if raw else 4 * -(-count // 3)
         piece = source[:length]
         packed = piece if raw else base64.b64decode(piece, validate=True)

@@ -11,7 +11,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, model
 LengthUnit = Literal["m", "cm", "mm", "inch"]
 AngleUnit = Literal["rad", "deg"]
 Number = Annotated[float, Strict()]
-"""A number; `true` and a number in quotes are refused."""
+"""A number. `true` and a number in quotes are refused."""
 Count = Annotated[int, Strict()]
 Switch = Annotated[bool, Strict()]
 Vector = tuple[Number, Number, Number]

@@ -158,9 +158,9 @@ def with_unit(table: Table, length_unit: str | None) -> Table:
 def read_csv(path: Path) -> Table:
     """Read comma-separated values with one header row.
 
-    Semicolons or tabs may separate the cells, with points or commas in the numbers; a notice says
-    so. Lines that are empty or begin with # are skipped. So are empty cells after the last named
-    column, because some programs end every line with a comma.
+    Semicolons or tabs may separate the cells, with points or commas in the numbers; a notice
+    says so. Empty lines and lines that begin with # are skipped. Empty cells after the last named
+    column are skipped, too, because some programs end every line with a comma.
     """
     lines = [
         (number, line.replace('"', ""))
@@ -240,8 +240,8 @@ def _row_notices(stated: str | None, rows: int) -> tuple[str, ...]:
 def read_trc(path: Path) -> Table:
     """Read markers of a `.trc` file.
 
-    A marker at exactly (0, 0, 0), an empty cell and NaN are gaps. Tabs separate cells, or blanks in
-    a line without tabs. Markers without a label get names like `marker 7`.
+    A marker at exactly (0, 0, 0), an empty cell and NaN are gaps. Tabs separate the cells, or
+    blanks in a line without tabs. Markers without a label get names like `marker 7`.
     """
     lines, changes = tab_separated(read_lines(path), TRC_LABELS)
     if len(lines) < 6 or not lines[0].startswith("PathFileType"):

@@ -109,7 +109,7 @@ def load_tibia(source: TibiaTable, time: Array, side: Side, cutoff_Hz: Cutoff) -
 
 
 def _odd_poses(recorded: Table, stamps: Array, poses: Array, time: Array) -> tuple[OddSample, ...]:
-    """Return the odd samples of both ends of the shank."""
+    """Return the odd samples of the shank's two ends."""
     near = (stamps >= time[0] - WINDOW) & (stamps <= time[-1] + WINDOW)
     ends = {
         "ankle": np.zeros(3),

@@ -197,8 +197,8 @@ def check_chain(
     """Raise an InputError unless the joints are exactly those of docs/patient.md.
 
     The six knee joints and the three joints of the patella must have the right type, axis, limits,
-    order and origin (the identity inside a chain). Links between them must have no mass, and no
-    other joint but the ankle may move.
+    order and origin (the identity inside a chain). Links between them must have no mass. Except the
+    ankle, no other joint may move.
 
     Args:
         robot: tree of a right leg, or of a mirrored left leg.

@@ -274,7 +274,7 @@ def with_insert(case: Case, mesh: Path) -> Case:
 
 
 def _derived(scene: Scene, motion: KneeMotion, parts: ImplantParts) -> KneeMotion:
-    """Return the motion with coordinates from the surfaces: guess, or roll and slip."""
+    """Return the motion with coordinates from the surfaces: initial guess, or roll and slip."""
     table = scene.motion
     if motion.unrecorded or table.motion == "roll-slip":
         check_frames(motion.time, table.cutoff_Hz, table.frames)

@@ -207,7 +207,7 @@ def with_preset(scene: Scene, preset: str, overrides: dict[str, Any] | None = No
 
 
 def with_overrides(scene: Scene, overrides: dict[str, Any]) -> Scene:
-    """Return a scene with overrides, as `load_scene` applies them to a file.
+    """Return a scene with overrides applied, as `load_scene` applies them to a file.
 
     Args:
         scene: the scene; its overrides and its preset stay.

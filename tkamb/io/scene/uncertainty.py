@@ -223,7 +223,12 @@ class UncertaintyTable(SceneTable):
     )
 
     def completed(self, from_markers: bool) -> Self:
-        """Return the table with default deviations for the pose coordinates that it lacks."""
+        """Return the table with default deviations for the pose coordinates that it lacks.
+
+        Args:
+            from_markers: whether the knee's motion is from skin markers; otherwise the defaults
+                are of fluoroscopy.
+        """
         defaults = asdict(SKIN_MARKER_ERROR if from_markers else FLUOROSCOPY_ERROR)
         missing = {
             name: value

@@ -159,6 +159,7 @@ class KneeTrial:
         Args:
             strength: factors of the muscles' active and passive strength, (m,).
             shank: shifts of the points where lines leave the shank, m, (m, 3).
+            thigh: shifts of the points where lines reach the thigh, m, (m, 3).
         """
         muscles = [
             replace(muscle, max_isometric_force_N=float(factor) * muscle.max_isometric_force_N)

@@ -51,6 +51,7 @@ class LoadSharing:
     Args:
         weight: weights w > 0, (n,).
         lowest: least activations, (n,).
+        highest: largest activations, (n,).
         offset: y without muscles, N or N·m, (m,).
         gain: change of y by full activation, N or N·m, (m, n).
         lower: least y, (m,); equal to `upper` for a prescribed y.
@@ -195,7 +196,7 @@ def kkt_residual(problem: LoadSharing, shared: Shared) -> float:
 
 
 def _programme(problem: LoadSharing, hessian: Array, gradient: Array) -> tuple[Array, Array, Array]:
-    """Return the minimum of 1/2 a.H a + g.a within all bounds, and its multipliers."""
+    """Return activations and multipliers of the minimum of 1/2 a.H a + g.a within all bounds."""
     try:
         import daqp
     except ImportError:

@@ -47,7 +47,7 @@ from tkamb.run.muscles.sharing import FrameProblems, Sharing
 
 @dataclass(frozen=True, eq=False)
 class Attachments:
-    """Effective attachments of muscles on one bone for pulls towards another.
+    """Effective attachments of muscles on a bone for pulls towards another bone.
 
     Args:
         points: attachments in the frame of the bone, m, (f, m, 3); NaN for a muscle without a
@@ -83,8 +83,7 @@ class Bones:
     def pull_on(self, bones: Sequence[str], seen_from: str) -> Array:
         """Return the wrench (f, m, 6) of unit tension of each muscle on some bones together.
 
-        It has moment (N·m per N) and force (N per N) in the frame of bone `seen_from`, about its
-        origin.
+        Moment (N·m per N) and force (N per N), in the frame of bone `seen_from` about its origin.
         """
         total = self.pulls[:, :, [self.index(name) for name in bones]].sum(axis=2)
         return self._seen(total, seen_from)
@@ -166,8 +165,8 @@ class MuscleTrial:
     def muscle_wrench(self, bones: tuple[str, ...], seen_from: str) -> Array:
         """Return the wrench (f, 6) of all muscles on some bones together.
 
-        It has moment (N·m) and force (N) in the frame of bone `seen_from`, about its origin. On
-        tibia and foot together, only muscles across the knee contribute.
+        Moment (N·m) and force (N), in the frame of bone `seen_from` about its origin. On tibia and
+        foot together, only muscles that cross the knee contribute.
         """
         pull = self.bones.pull_on(bones, seen_from)
         return np.einsum("fm,fmi->fi", self.force_N, pull)
@@ -175,8 +174,8 @@ class MuscleTrial:
     def knee_reaction(self) -> Array:
         """Return the wrench (f, 6) of the femur on the tibia without the muscles, mainly contact.
 
-        It is what the motion of tibia and foot requires minus gravity, external loads and muscles.
-        It has moment (N·m) and force (N) in the tibia's frame, about its origin.
+        Moment (N·m) and force (N), in the tibia's frame about its origin. It is the wrench that the
+        motion of tibia and foot requires, minus gravity, external loads and muscles.
 
         Raises:
             InputError: muscles end on the patella, and the force of the patellar ligament is
@@ -283,7 +282,7 @@ def _bones(
 def _strength(
     kinematics: Kinematics, motion: CoordinateMotion, sharing: Sharing, pulls: Pulls
 ) -> tuple[Array, Array]:
-    """Return active and passive forces at full activation (f, m), N."""
+    """Return active forces at full activation and passive forces (f, m), N."""
     model = kinematics.model
     muscles = [model.muscles[name] for name in pulls.names]
     if sharing.law == "isometric":

@@ -44,14 +44,15 @@ class GroundReactionLimitSettings:
     """m: least mean distance of the centre of pressure ahead of the ankle. Seven recordings have
     0.019 to 0.061, and -0.019 or less with the opposite sign."""
     ankle_distance: float = 0.015
-    """m: horizontal distance from the ankle within which a centre of pressure that stays is likely
-    in another unit. In standing it is 0.04 m ahead of the ankle.
-    """
+    """m: horizontal distance from the ankle. A centre of pressure that stays within it is likely
+    in another unit. In standing it is 0.04 m ahead of the
+    ankle."""
     max_unloaded_stance: float = 0.15
     """s: longest time without force on a standing foot. Four recorded walks have at most 0.02 s.
     A missing force plate causes 0.4 s."""
     unloaded_force: float = 0.05
-    """BW: force below which a foot is unloaded; the noise of force plates is smaller."""
+    """BW: force below which a foot is unloaded. The noise of force plates is
+    smaller."""
     max_peak_ratio: float = 1.6
     """1: largest ratio of the peak forces of one foot in a walk. Three recordings
     have 1.1."""

@@ -113,7 +113,7 @@ def _on_carrier(case: Case, end: "LinkPoint") -> tuple[str, Array]:
 
 
 def _is_plausible_end(carrier: str, place: Array) -> bool:
-    """Return whether a ligament may end there, see `_on_carrier`."""
+    """Return whether a ligament may end at a position (3,), m, from `_on_carrier`."""
     beyond = {"tibia": place[1], "femur": -place[1]}.get(carrier, 0.0)
     return (
         float(np.linalg.norm(place)) <= LINE_LIMITS.max_attachment_distance
@@ -143,6 +143,7 @@ def strain_questions(
 
     Args:
         strains: name of a bundle -> strain at the recorded poses, (f,).
+        time: times of the frames, s, (f,).
     """
     if not ligaments:
         return

@@ -126,7 +126,7 @@ def motion_questions(case: Case) -> Iterator[Question]:
 
 
 def _translation_questions(case: Case) -> Iterator[Question]:
-    """Ask about translations that hardly change; constant ones are prescribed values."""
+    """Ask about recorded translations that hardly change. Constant ones are prescribed values."""
     motion = case.motion
     names = ("ap", "si", "ml")
     if motion.unrecorded or motion.markers is not None:
@@ -217,9 +217,8 @@ class SignSettings:
     """Criteria for a question about the sign of a coordinate."""
 
     frames: int = 15
-    """1: number of checked frames, evenly spread over the motion. More change the standard
-    deviations by a few per cent only.
-    """
+    """1: number of checked frames, evenly spread over the motion. More frames change
+    the standard deviations by a few per cent only."""
     ap_spread: float = 0.6 * MILLIMETRE
     """m: standard deviation of the mean gap from which the sign of AP is checked. Fluoroscopy of
     subject DM has 0.3 mm, and 1.3 mm with the wrong sign."""

@@ -25,7 +25,8 @@ class SegmentLimitSettings:
     reciprocal. The ratio is up to 1.35 between cadaver studies, up to 1.3 with obesity, and 2.2 for
     pounds that are read as kilograms."""
     max_patella_offset: float = 0.05
-    """m: largest distance of the patella's centre of mass from its origin; a patella is smaller."""
+    """m: largest distance of the patella's centre of mass from its origin. A patella
+    is smaller."""
     max_insert_rotation: float = 20.0 * DEGREE
     """rad: largest rotation of the insert in the tibia. The slope is up to 10 deg,
     and definitions of the tibia's axes differ."""
@@ -164,9 +165,8 @@ class ImplantShapeLimitSettings:
     to front has less than 0.1."""
     min_opening_share: float = 0.05
     """1: a component opens in the direction from its surface's centroid to the centre of its
-    bounding box. It is checked if that distance is more than this share of the largest extent. Ten
-    components have 0.09 to 0.14, a sphere has 0.
-    """
+    bounding box. This direction is checked if that distance is more than this share of the largest
+    extent. Ten components have 0.09 to 0.14, a sphere has 0."""
     max_opening_angle: float = 60.0 * DEGREE
     """rad: largest angle between the opening of the component and superior. The same ten components
     have at most 27 deg."""
@@ -184,8 +184,7 @@ class ImplantShapeLimitSettings:
     dry joints 0.2."""
     outline_offset: float = 0.25
     """1: distance from the middle to the compared outlines of an insert, as a share of its width.
-    The condyles lie there.
-    """
+    The condyles are there."""
 
 
 IMPLANT_SHAPE_LIMITS = ImplantShapeLimitSettings()

@@ -332,7 +332,7 @@ def _computed(outcome: Outcome) -> dict[str, Array]:
 
 
 def _bin_indices(values: Array, axis: str, width: float) -> NDArray[np.int64]:
-    """Return the bin number of each frame; 100 % of the cycle is in the last bin."""
+    """Return the bin number of each frame. 100 % of the cycle belongs to the last bin."""
     result = np.floor(values / width + BIN_TOLERANCE).astype(int)
     end = axis == CYCLE and np.isclose(values, WHOLE_CYCLE, rtol=0, atol=BIN_TOLERANCE * width)
     return np.where(end, result - 1, result)

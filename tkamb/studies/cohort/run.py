@@ -166,8 +166,7 @@ class Part:
     """Part of a cohort's runs that one job of a batch queue computes.
 
     Args:
-    index: number of the part of the runs, from 1 to `count`, that one job of a batch queue
-        computes.
+        index: number of the part, from 1 to `count`.
     """
 
     index: int

@@ -36,7 +36,7 @@ LARGEST_ADDUCTION = 0.04
 @dataclass(frozen=True)
 class TouchingPose:
     """Pose at which both condyles touch: SI position, mm, adduction, rad, and the medial and
-    lateral contact point in the insert frame, mm, shape (2, 3)."""
+    lateral contact point in the insert frame, mm, (2, 3)."""
 
     si: float
     adduction: float
@@ -132,7 +132,10 @@ class Design:
         return self.articulation.insert
 
     def write_meshes(self, folder: Path) -> tuple[Path, ...]:
-        """Write the parts as binary STL files, mm, with and without a cam, and return the paths."""
+        """Write the parts as binary STL files in mm and return the paths.
+
+        A femoral component with a cam is written with and without it.
+        """
         folder.mkdir(parents=True, exist_ok=True)
         meshes = {
             FEMORAL_MESH: self.femoral.mesh(),

@@ -61,6 +61,7 @@ def joined(cam: Cam, box_half: float, vertices: Array, faces: Ids) -> tuple[Arra
     Args:
         box_half: half the width of the box, mm. Its walls are the planes z = ±box_half.
         vertices: vertices of the component without the cam, mm, (n, 3).
+        faces: faces of the component without the cam, (k, 3).
     """
     cam_direction = np.arctan2(-cam.centre_ap, -cam.centre_si)
     angle = np.degrees(np.arctan2(-vertices[:, 0], -vertices[:, 1]) - cam_direction)
@@ -265,7 +266,7 @@ class FemoralComponent:
         return np.asarray(top + (self.width_half - top) * self._taper(phi))
 
     def notch(self, phi: ArrayLike) -> Array:
-        """Return the ML distance of the notch's edge from the middle; its front is elliptic."""
+        """Return the ML distance of the notch's edge from the middle. The front is elliptic."""
         start, end = np.radians(self.notch_phi)
         s = np.clip((np.asarray(phi) - start) / (end - start), 0.0, 1.0)
         s = np.where(s < 1e-9, 0.0, s)
@@ -277,7 +278,7 @@ class FemoralComponent:
         return np.asarray(radii - np.sqrt(radii**2 - self.ridge(phi) ** 2))
 
     def depth(self, phi: ArrayLike, z: ArrayLike) -> Array:
-        """Return the depth of the surface below the J-curve of the ridges."""
+        """Return the depth of the articular surface below the J-curve of the ridges."""
         u, apex, coronal = np.abs(z), self.ridge(phi), self.coronal_radius
         tangent = apex * self.groove_radius / (self.groove_radius + coronal)
         across = np.clip(u - apex, -coronal, coronal)
@@ -368,6 +369,6 @@ class FemoralComponent:
 
 
 def rounded_edge(distance: ArrayLike, radius: ArrayLike) -> Array:
-    """Return how far (mm) a rounded edge lies below the surface at a distance (mm) from it."""
+    """Return how far a rounded edge lies below the surface, mm, at a distance from the edge, mm."""
     inside = np.clip(np.asarray(radius) - distance, 0.0, radius)
     return np.asarray(radius - np.sqrt(np.asarray(radius) ** 2 - inside**2))

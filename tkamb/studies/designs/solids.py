@@ -56,7 +56,7 @@ def close_sheets(
 
 
 def _ids(rows: int, columns: int, fork: int | None, start: int) -> Ids:
-    """Return the vertex of every grid node; up to the fork the middle columns share one."""
+    """Return the vertex number of every grid node. Up to the fork the middle columns share one."""
     ids = start + np.arange(rows * columns).reshape(rows, columns)
     if fork is not None:
         ids[: fork + 1, columns // 2] = ids[: fork + 1, columns // 2 - 1]

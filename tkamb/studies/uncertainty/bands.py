@@ -27,15 +27,14 @@ from tkamb.run.status import out_of_equilibrium
 
 ENDS = ("p05", "p95")
 TOTALS_N = ("force_si_N", "force_total_N")
-"""Columns with the total force, of which the first one present is used."""
+"""Columns of results.csv with the total force. The first one present is used."""
 PATELLOFEMORAL = ("patellofemoral_tangential_N", "patellofemoral_N")
 """Columns with the force across the button's normal, and along it."""
 ROUND_OFF = 1e-9
 """Ratio of standard deviation to magnitude below which a result counts as constant."""
 SAMPLES_PER_INPUT = 6
-"""Smallest number of samples per input for a joint regression; with fewer the shares are mostly
-chance.
-"""
+"""Smallest number of samples per input for a joint regression. With fewer samples the shares are
+mostly chance."""
 NUMBER = re.compile(r"[-−]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 MOST_CAUSES = 3
 
@@ -193,7 +192,7 @@ def discrepancy_columns(
 
 
 def causes(problems: np.ndarray) -> dict[str, float]:
-    """Return cause -> its share of the failed frames, for the most frequent ones.
+    """Return cause -> its share of the failed frames, for the most frequent causes.
 
     Args:
         problems: reason why each frame failed, "" if it did not. Its last clause is the cause,

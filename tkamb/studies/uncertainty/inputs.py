@@ -247,7 +247,7 @@ class Draw:
         return np.array([self.error(f"{name}.{axis}") for axis in AXES])
 
     def turn(self, name: str) -> Array:
-        """Return the error of an orientation, a rotation vector, rad, (3,): ap, si, ml."""
+        """Return the error of an orientation as a rotation vector, rad, (3,): ap, si, ml."""
         return np.array([self.error(f"{name}.about_{axis}") for axis in AXES])
 
 
@@ -320,15 +320,15 @@ class Point:
 
     @classmethod
     def of(cls, number: int, normal: Array) -> "Point":
-        """Return the point of a sample with noise of its own."""
+        """Return the point of a sample that defines the noise of all inputs."""
         return cls(normal, (number,) * len(normal))
 
 
 def crossed_points(first: Array, second: Array) -> list[Point]:
     """Return the points of Saltelli's design: A, B, and A with one column from B for each input.
 
-    The noise of an input is taken from the same matrix as its column. They are sorted: n of A, n of
-    B, then n for each input.
+    The noise of an input is taken from the same matrix as its column. The points are sorted: n of
+    A, n of B, then n for each input.
 
     Args:
         first: matrix A of standard normal values, (n, d).
@@ -357,8 +357,13 @@ def one_at_a_time(dimensions: int) -> list[Point]:
 def normal_samples(method: str, count: int, dimensions: int, seed: int) -> Array:
     """Return samples (count, dimensions) of independent standard normal inputs.
 
-    "lhs" makes Latin hypercubes of `BLOCK` samples, "sobol" one scrambled Sobol' sequence, which
-    the normal quantile function maps.
+    "lhs" makes Latin hypercubes of `BLOCK` samples, "sobol" one scrambled Sobol' sequence. The
+    normal quantile function maps these uniform samples to normal ones.
+
+    Args:
+        method: sampling method, "lhs" or "sobol".
+        count: number of samples, at least 1.
+        seed: seed of the random numbers.
     """
     if count < 1:
         raise InputError(f"{count} is not a number of samples", "samples", "give at least 1")

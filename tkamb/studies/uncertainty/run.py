@@ -266,7 +266,7 @@ class _Job:
 
     @property
     def design(self) -> str:
-        """Return the sampling method, with the number of rows of Saltelli's design."""
+        """Return the sampling method. With Saltelli's design it includes the number of rows."""
         return (
             f"{self.method}, Saltelli's design of {self.crossed}" if self.crossed else self.method
         )

@@ -66,8 +66,9 @@ if TYPE_CHECKING:
 
 
 def varied_case(case: Case, draw: Draw) -> Case:
-    """Return the case with varied inputs but the insert's modulus and shared muscles, which it does
-    not contain. Velocities and accelerations are those of the recording.
+    """Return the case with varied inputs. Velocities and accelerations are those of the recording.
+
+    A case contains neither the insert's modulus nor the shared muscles. `Sampler` varies these.
     """
     tibia, coordinates = displaced_by_markers(case, draw)
     varied = replace(case, tibia=tibia, motion=replace(case.motion, coordinates=coordinates))
@@ -218,7 +219,7 @@ def _on_femur(case: Case, end: LinkPoint, draw: Draw) -> LinkPoint:
 
 
 def _wrap_on_femur(case: Case, wrap: WrapObject, draw: Draw) -> WrapObject:
-    """Return a ligament's surface, whose centre moves as in `_on_femur`."""
+    """Return a ligament's surface, moved as `_on_femur` moves its centre."""
     centre = _on_femur(case, LinkPoint(wrap.body, wrap.pose[:3, 3]), draw).position
     return replace(wrap, pose=pose(wrap.pose[:3, :3], centre))
 
@@ -280,7 +281,7 @@ def displaced_by_markers(case: Case, draw: Draw) -> "tuple[BodyMotion | None, Ar
 
 
 def _fit_error(segment: MarkerSegmentTable, draw: Draw, is_left: bool) -> Array:
-    """Return the pose (4, 4) of the fitted segment in the nominal one, of a right leg."""
+    """Return the pose (4, 4) of the fitted segment in the nominal one, mirrored to a right leg."""
     points = np.array(list(segment.markers_mm.values())) * MILLIMETRE
     points = points @ MIRROR if is_left else points
     errors = np.array([draw.place(f"marker.{label}") for label in segment.markers_mm])
@@ -306,7 +307,7 @@ class Sample:
 
     @property
     def failed(self) -> np.ndarray:
-        """Whether each frame failed, shape (frames,)."""
+        """Whether each frame failed, (frames,)."""
         return self.problems != ""
 
 
@@ -391,7 +392,7 @@ class Sampler:
 
 
 class BandWorker:
-    """Computes samples in a worker, which can be prepared before the column names are known."""
+    """Computes samples in a worker. It can be prepared before the column names are known."""
 
     def __init__(self, scene: Scene, frames: range) -> None:
         self._scene, self._frames = scene, frames

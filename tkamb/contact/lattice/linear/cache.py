@@ -100,6 +100,9 @@ def cached_operator(
     If the folder cannot be written, the operator is computed each time.
 
     Args:
+        fixed: mask of the held unknowns, (3n,).
+        contact_nodes: nodes of the contact surface, (c,).
+        coarse: whether its factor is stored in 16-bit integers.
         limit: largest size of the folder, bytes; a larger operator is not stored.
     """
     if int((~fixed).sum()) < FACTOR_CACHE.least_unknowns:
@@ -127,6 +130,10 @@ def check_operator(
     operator: ElasticOperator, solid: Solid, fixed: Mask, contact_nodes: Index
 ) -> None:
     """Check that a stored operator belongs to the solid.
+
+    Args:
+        fixed: mask of the held unknowns, (3n,).
+        contact_nodes: nodes of the contact surface, (c,).
 
     Raises:
         InputError: the operator has other unknowns, or does not invert the stiffness.

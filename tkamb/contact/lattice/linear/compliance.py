@@ -34,7 +34,8 @@ class ResponseSettings:
     """Products of columns of Z, for the compliance."""
 
     gathered_columns: int = 512
-    """Columns that are copied for BLAS at a time; their 3 MB fit into a processor's cache."""
+    """Columns that are copied for BLAS at a time. Their 3 MB fit into a processor's
+    cache."""
     few_columns: int = 12
     """Largest number of columns that are multiplied without BLAS. The copy costs more time than it
     saves for so few.
@@ -254,6 +255,7 @@ def _products(values: Array, places: Index, few: Array) -> Array:
 
 @compiled
 def _subtract_columns(target: Array, columns: Index, values: Array) -> None:
+    """Subtract values (n, k) from columns (k,) of the target."""
     for i in range(len(values)):
         for j in range(len(columns)):
             target[i, columns[j]] -= values[i, j]
@@ -290,7 +292,7 @@ class HalfSolves:
         self._columns: list[NDArray[Any]] = []
 
     def add(self, member: int, front: Front) -> None:
-        """Add the columns of the next front, before it is rounded."""
+        """Add the columns of the next front, from its block before rounding."""
         first, last = self._spans[member]
         if last == first:
             return
@@ -314,7 +316,7 @@ class HalfSolves:
         return HalfResponse.of(self._rank, blocks, joined(self._columns, self._precision))
 
     def _right_side(self, member: int) -> NDArray[Any]:
-        """Return a front's right-hand side (columns of its span, unknowns of the front)."""
+        """Return a front's current right-hand side (columns of its span, unknowns of the front)."""
         if member not in self._waiting:
             first, last = self._spans[member]
             shape = (last - first, self._starts[member + 1] - self._starts[member])

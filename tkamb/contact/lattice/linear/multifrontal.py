@@ -48,7 +48,7 @@ class Dissection:
 
 
 def dissect(index: Index, joined: sparse.csr_matrix, leaf: int = 48) -> Dissection:
-    """Return the nested dissection of a lattice.
+    """Return the nested dissection of a lattice's nodes.
 
     Args:
         index: lattice index (i, j, k) of each node, (n, 3).

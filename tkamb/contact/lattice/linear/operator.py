@@ -190,7 +190,7 @@ class ElasticOperator:
         return self.nodal(y)
 
     def start(self, force: Array, fronts: Shares | None = None) -> Array:
-        """Return y = L⁻¹ f in elimination order, for nodal forces (n, 3), N.
+        """Return y = L⁻¹ f in elimination order, for nodal forces (n, 3).
 
         Args:
             force: nodal forces, N; zero except on the nodes of the fronts.
@@ -313,6 +313,7 @@ def prepare_operator(
         stiffness: symmetric, positive definite on the free unknowns, (3n, 3n).
         index: lattice index of each node, (n, 3).
         fixed: mask of the held unknowns, (3n,).
+        contact_nodes: nodes of the contact surface, (c,).
         precision: type of the stored numbers and of the response. The factor is computed in
             float64.
         coarse: whether the factor is stored in 16-bit integers, in half the memory of single

@@ -68,7 +68,7 @@ FAMILY_SHARE = np.array([0.25] * 3 + [0.5] * 6 + [1.0] * 4)
 FACES = np.array(
     [[0, 3, 7, 4], [1, 2, 6, 5], [0, 1, 5, 4], [3, 2, 6, 7], [0, 1, 2, 3], [4, 5, 6, 7]]
 )
-"""Corners of the faces -x, +x, -y, +y, -z, +z."""
+"""Corners of the six faces: -x, +x, -y, +y, -z, +z."""
 
 
 EDGES = np.array(

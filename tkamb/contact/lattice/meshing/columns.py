@@ -227,7 +227,7 @@ class Ends:
 
 
 def place_columns(surface: Surface, spacing: Array) -> NodeField:
-    """Return the grid over the bounding box, with nodes placed along y."""
+    """Return the grid over the surface's bounding box, with nodes placed along y."""
     x, z = (_grid_line(surface, axis, spacing[axis]) for axis in (0, 2))
     intervals = inside_intervals(surface, 1, z, x)
     i, k = intervals.second, intervals.first
@@ -346,8 +346,8 @@ def refired_inwards(
 ) -> Array:
     """Return the heights (n,), m, of nodes that are moved onto walls.
 
-    A vertical ray on a rough wall may miss. The target (n, 3), m, is then moved inside by
-    `wall_inset` along `inward` (n, 2), x and z, in place, and the ray is repeated.
+    A vertical ray on a rough wall may miss the part. The target (n, 3), m, is then moved inside by
+    `wall_inset` along `inward` (n, 2), x and z, in place, and the ray repeated.
     """
     height = refired(field, nodes, target, rays)
     missed = np.flatnonzero(~np.isfinite(height))
@@ -362,8 +362,8 @@ def refired_inwards(
 def refired(field: NodeField, nodes: Nodes, target: Array, rays: RayCaster) -> Array:
     """Return the heights (n,), m, of nodes after a move sideways to `target` (n, 3).
 
-    Ends of intervals stay on the surface, other nodes keep their height. The result is NaN where
-    the height of the surface changes by more than `MAX_HEIGHT_CHANGE`.
+    Ends of intervals stay on the surface, and other nodes keep their height. The result is NaN
+    where the height of the surface changes by more than `MAX_HEIGHT_CHANGE`.
     """
     height = field.points[..., 1][nodes]
     for end, facing in ((field.upper_end[nodes], 1.0), (field.lower_end[nodes], -1.0)):

@@ -21,7 +21,7 @@ ON_MESH_DISTANCE = 1e-6
 
 
 GAUSS_POINTS = 0.5 + np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / (2 * np.sqrt(3.0))
-"""The 2 x 2 Gauss points of a face, in [0, 1]², with equal weights."""
+"""The 2 x 2 Gauss points of a face, in [0, 1]². Their weights are equal."""
 
 
 @dataclass(frozen=True, eq=False)

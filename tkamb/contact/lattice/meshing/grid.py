@@ -142,10 +142,10 @@ def volume_error(nodes: Array, cells: Index, insert: Surface) -> float:
 
 
 def _sorted_faces(cells: Index) -> tuple[Index, Mask]:
-    """Return the faces of all cells, the two copies of an inner face next to each other.
+    """Return the faces of all cells, with the two copies of an inner face next to each other.
 
     The smallest and the largest node identify a face of a grid. Each is 6 cell + row of `FACES`,
-    (6c,). Also returns whether it is the same face as the next one, (6c - 1,).
+    (6c,); also returns whether it is the same face as the next one, (6c - 1,).
     """
     ends = np.sort(cells[:, FACES].reshape(-1, 4), axis=1)[:, [0, 3]]
     order = np.lexsort((ends[:, 1], ends[:, 0]))
@@ -225,12 +225,12 @@ class Lattice:
 
     @cached_property
     def springs(self) -> Springs:
-        """Springs between the nodes of each cell, each once."""
+        """Springs between the nodes of each cell, each spring once."""
         return join_springs(self.cells, len(self.nodes))
 
     @cached_property
     def piece_of_node(self) -> Index:
-        """Number (n,) of each node's piece; pieces share no cell face."""
+        """Number (n,) of each node's piece; two pieces share no cell face."""
         piece = np.zeros(len(self.nodes), np.int64)
         piece[self.cells] = connected_pieces(self.cells)[:, None]
         return piece
