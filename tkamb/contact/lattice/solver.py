@@ -24,8 +24,8 @@ and the active set has stopped changing. The second residual estimates the relat
 approach, because an error du = e u leaves r = e K_T u. The load and lambda >= 0 hold to rounding in
 every pass.
 
-Else an iteration that began with the loads of an earlier solution begins again without them.
-Otherwise `solve_by_newton` continues, which is also the reference.
+After `max_passes`, an iteration that began with the loads of an earlier solution begins again
+without them; any other continues with `solve_by_newton`, which is also the reference.
 """
 
 from dataclasses import dataclass, replace
