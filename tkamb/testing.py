@@ -70,6 +70,7 @@ def check_contact_model(
         load: N, compressive.
         tolerance: 1, relative tolerance of forces, approach and pressure between equivalent
             evaluations.
+        integral_tolerance: 1, relative tolerance of the integral of pressure over the map.
 
     Raises:
         ConformanceError: the model lacks a property of the contract.

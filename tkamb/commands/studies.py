@@ -237,6 +237,9 @@ def _study_stability(options: argparse.Namespace, directory: Path) -> int:
 def gather(row_source: Iterable[T], costs: Sequence[float]) -> tuple[list[T], bool]:
     """Collect rows under a progress bar that shows the remaining time.
 
+    Args:
+        costs: expected time of each row, in any unit.
+
     Returns:
         The rows, and whether all were computed. Ctrl-C ends the collecting, not the command.
     """

@@ -293,16 +293,18 @@ class _Condyle:
 
 
 class _CloseRegion:
-    """Finds the close region of another body for a part, `faces` (k,), of this one.
+    """Part of one body's surface, prepared to find the close region on another body.
 
     On conforming surfaces the closest point of two meshes moves by millimetres from pose to pose,
     although the gap changes by a few micrometres. The centre of the close region moves smoothly:
 
         c = sum w_i p_i / sum w_i,   w_i = A_i exp(-(g_i - g) / d)
 
-    Sample i has the area A_i, the signed gap g_i and the nearest point p_i on the other body. Here
-    g is the smallest gap and d is `CONDYLE.facet_depth`. If the gap has a sharp minimum, the centre
-    is the closest point.
+    Sample i has the area A_i, the signed gap g_i and the nearest point p_i on the other body; g is
+    the smallest gap and d the depth of a facet (`CONDYLE.facet_depth`). If the gap has a sharp
+    minimum, the centre is the closest point.
+
+    `faces` (k,) are the triangles of the part.
     """
 
     def __init__(self, surface: Surface, faces: Index) -> None:

@@ -203,7 +203,7 @@ class AssembledKnee:
 
     @property
     def _instant_ligaments(self) -> "tuple[Ligament, ...]":
-        """Without those of a released patella."""
+        """The ligaments of the equations, without those of a released patella."""
         if self.patella is None or not self._has_own_patella_lines:
             return self.ligaments
         return tuple(bundle for bundle in self.ligaments if bundle not in self._others)
@@ -229,22 +229,22 @@ class AssembledKnee:
 
     @property
     def femoral(self) -> Any:
-        """In its own frame, mirrored for a left knee; None: not given."""
+        """The femoral component in its own frame, mirrored for a left knee; None: not given."""
         return self._surfaces.femoral
 
     @property
     def insert(self) -> Any:
-        """In the insert frame, mirrored for a left knee; None: not given."""
+        """The insert in the insert frame, mirrored for a left knee; None: not given."""
         return self._surfaces.insert
 
     @property
     def button(self) -> Any:
-        """In the patella's frame, mirrored for a left knee; None: not given."""
+        """The patellar button in the patella's frame, mirrored for a left knee; None: not given."""
         return self._surfaces.button
 
     @property
     def _query(self) -> "ClosestPointQuery":
-        """Prepared at the first use."""
+        """Query for closest points of femoral component and insert, prepared at the first use."""
         return self._need_contact().pair.closest_points
 
     def create_data(self) -> KneeData:

@@ -244,8 +244,9 @@ def button_in_patella(button: Surface) -> Array:
 def without_pegs(body: Surface) -> Surface:
     """Return a button in the button frame without the parts below its flat back.
 
-    Pegs are cemented into the bone and do not deform. The end of a peg moves up to y = 0 and closes
-    the back. Its wall, which has no area there, is removed.
+    Pegs are cemented into the bone, so that they do not deform. Their points move up to y = 0: the
+    end of a peg closes the back, and its wall, which has no area there, is removed. A peg that
+    grows wider towards its end would cover the back twice; its faces cancel.
     """
     if body.bounds[0, 1] > -PEG:
         return body
@@ -256,7 +257,7 @@ def without_pegs(body: Surface) -> Surface:
 
 
 def _of_button(words: str) -> str:
-    """Replace a contact model's names by those of the button's parts."""
+    """Return a message of a contact model with the names of the button's parts."""
     for ours, theirs in (("insert", "button"), ("condyle", "facet")):
         words = words.replace(ours, theirs)
     return f"button: {words}"

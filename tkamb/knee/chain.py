@@ -124,12 +124,12 @@ class Chain:
 
     @property
     def insert_in_tibia(self) -> Array:
-        """pose_insert_in_tibia (4, 4)."""
+        """The pose of the insert in the tibia, pose_insert_in_tibia (4, 4)."""
         return inverse(self._tibia_in_root) @ self._insert_in_root
 
     @property
     def patella_joint_in_femur(self) -> Array:
-        """pose_joint_in_femur (4, 4)."""
+        """The pose (4, 4) of the patella's joint in the femur."""
         # The patella moves in the x-y plane of this joint.
         return self.model.jointPlacements[self.model.getJointId(PATELLA_JOINT_NAMES[0])].homogeneous
 
@@ -213,7 +213,7 @@ class ChainState:
 
     @cached_property
     def laboratory_in_insert(self) -> Array:
-        """pose_laboratory_in_insert (4, 4)."""
+        """The pose of the laboratory in the insert, pose_laboratory_in_insert (4, 4)."""
         return inverse(self.insert_in_laboratory)
 
     def pose(self, link: str) -> Array:

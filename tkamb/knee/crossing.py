@@ -144,7 +144,7 @@ class MuscleShare:
 
     @property
     def _knee_reserve(self) -> Array:
-        """On the tibia about the insert's z, (3,), N·m."""
+        """The knee's reserve moment on the tibia about the insert's z, (3,), N·m."""
         return self.reserve[self.flexion] * unknowns.AXES["ml"]
 
 

@@ -202,8 +202,10 @@ def shortest_strings(start: Array, end: Array, axes: Array, half: Array | None =
         start: points outside the ellipsoid, m, (f, 3), like `end`; the segment between them
             passes through the ellipsoid.
         axes: semi-axes, m, (3,).
-        half: direction of the half on which the string must touch, (3,); None: either half. Without
-            a taut string on it `converged` is False.
+        half: direction of the half on which the string must touch, (3,); None: either half.
+
+    Returns:
+        The strings. If there is no taut string on the half, `converged` is False.
     """
     count = len(start)
     contour, pieces, rival = planar_starts(start / axes, end / axes, axes, half)

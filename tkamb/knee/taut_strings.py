@@ -281,11 +281,10 @@ class WrappedStrings:
     """f strings over w objects.
 
     Args:
-    order: indices of the objects that each of f strings touches, from start to end, then -1,
-        (f, w).
-    entry: points where the strings meet the objects, m, (f, w, 3); they leave at `exit`,
-        `arc_m` (f, w), m, later (NaN: not converged).
-    push: force of a shrinking object on start and end, per unit tension, (f, w, 2, 3).
+        order: indices of the objects that a string touches, from start to end, then -1, (f, w).
+        entry: points where the strings meet the objects, m, (f, w, 3); they leave at `exit`.
+        arc_m: lengths on the objects, m, (f, w); NaN if the iteration has not converged.
+        push: force of a shrinking object on start and end, per unit tension, (f, w, 2, 3).
     """
 
     order: Index

@@ -200,10 +200,10 @@ def patellofemoral(point: Array, normal: Array, femur_ml: Array) -> list[Unknown
 
 
 def unloaded_patella(point: Array, femur_ml: Array) -> list[Unknown]:
-    """Return the loads that balance the patella's weight, if it is released (massless) or its
-    extensor mechanism slack.
+    """Return the loads that balance the patella's weight if no other loads do.
 
-    `point` (3,), m, is the contact point on the femur.
+    They replace a slack extensor mechanism, or belong to a released, massless patella. `point`
+    (3,), m, is the contact point on the femur.
     """
     # Any two directions in the sagittal plane can be used.
     first = cross(femur_ml, AXES["ap"])

@@ -218,12 +218,12 @@ _RANGES = {
 def known_error(
     model: str, resolution_mm: float, material: str, options: Mapping[str, Any] | None = None
 ) -> KnownError | None:
-    """Return the known error of a setting; None: not measured, as plug-ins, other spacings than the
-    study's and materials but polyethylene and polyethylene-linear.
+    """Return the known error of a setting; None: not measured.
 
     Args:
         model: name of the contact model. Plug-ins were not measured.
         resolution_mm: spacing of the map points, mm. Only the spacings of the study were measured.
+        material: material of the insert. Polyethylene and polyethylene-linear were measured.
     """
     label = setting_label(model, options or {})
     return known_errors().get((label, float(resolution_mm), material))
@@ -286,7 +286,8 @@ _PLACES = {"interior": "in the interior", "flank": "on a flank", "edge": "at an 
 def is_large(error: Mapping[str, Any] | str, names: Iterable[str]) -> bool:
     """Return whether the known error of any of the quantities exceeds `notable_share`.
 
-    Contact at an edge has a flag of its own: measured situations count without it.
+    Contact at an edge has a flag of its own. Where situations were measured, only interior and
+    flanks count.
     """
     if isinstance(error, str):
         return False

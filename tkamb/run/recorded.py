@@ -134,7 +134,7 @@ def compare_emg(envelopes: "Envelopes", columns: Mapping[str, Any]) -> dict[str,
 
     The agreement is Pearson's r and RMSE of a(t) and e(t), and the lag L with the largest r of a(t)
     and e(t - L). The lag is positive if the activation is later than the envelope. It uses frames
-    with an envelope for all `LAGS`, and is NaN at the first or last lag.
+    with an envelope for all `LAGS`, and is NaN if r is largest at the first or last lag.
     """
     time = np.asarray(columns["time_s"])
     result = {}

@@ -51,10 +51,11 @@ class FrameSolver:
     """Computes the frames of a case.
 
     Args:
-        slips: side -> rolling and slip of a condyle in the recorded motion, perhaps from another
-            solver of this case; None: they are computed.
+        frames: frames to compute; None: all.
+        slips: slips from another solver of this case; None: they are computed.
 
     Attributes:
+        slips: side -> rolling and slip of a condyle in the recorded motion.
         before: starts of earlier frames, the initial guesses for the next frame.
 
     Raises:

@@ -67,6 +67,7 @@ def summary_of(
     """Return the content of summary.json (docs/results.md).
 
     Args:
+        seconds: part of the computation -> computing time, s.
         path: path of the scene file; None: the scene is not from a file.
         strains: ligament bundle -> strains at `STRAIN_FLEXIONS`.
     """

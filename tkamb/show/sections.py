@@ -90,8 +90,8 @@ class TextTable:
     """A table of texts.
 
     Args:
-    rows: cells below each heading, a name or (name, unit). In a table of strains, the bundle
-        comes first.
+        headings: heading of each column, a name or (name, unit).
+        rows: cells of each row. In a table of strains, the name of the bundle comes first.
     """
 
     headings: Sequence[Any]

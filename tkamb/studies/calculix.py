@@ -178,7 +178,12 @@ class PeerAnswer:
 def measure_by_calculix(
     case: StudyCase, grid_mm: float, longest: float = LONGEST_SECONDS
 ) -> Measure:
-    """Return cost and results of CalculiX on a case; after an error only the status."""
+    """Return cost and results of CalculiX on a case; after an error only the status.
+
+    Args:
+        grid_mm: edge length of the hexahedra, mm.
+        longest: time limit, s.
+    """
     try:
         answer = press_by_calculix(case.pair, case.load, case.pose, grid_mm, longest=longest)
     except ComputationError as error:
@@ -212,6 +217,7 @@ def press_by_calculix(
         pose: pose_femoral_in_insert, (4, 4); its y has no effect.
         grid_mm: edge length of the hexahedra, mm.
         element: element type, "C3D8I" or "C3D8".
+        longest: time limit, s.
 
     Raises:
         InputError: CalculiX is not installed, or the deck cannot express the material or bearing.

@@ -1,8 +1,8 @@
 """Times, memory and results of one contact model on one case.
 
-Each job runs in a process of its own, which reads a `Job` and prints the `Measure` as JSON. The
-peak memory is that of the job, and a crash or a hang is recorded. One thread gives repeatable
-times.
+Each job runs in a process of its own: `python -m tkamb.studies.measures` reads a `Job` as JSON from
+standard input and prints the `Measure` as JSON. So the peak memory is that of the job, and a crash
+or a hang is recorded. One thread gives repeatable times.
 
 `quantities`, `errors` and `map_error` compare two contact results.
 """
@@ -149,7 +149,8 @@ class Job:
     """A contact model and a case to measure.
 
     Args:
-    scene: path of a user's scene, for the cases of that scene.
+        resolution_mm: spacing of the model's map points, mm.
+        scene: path of a user's scene, for the cases of that scene.
     """
 
     case: str

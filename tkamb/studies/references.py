@@ -158,11 +158,12 @@ WIDTH_EFFECT = 0.005
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Solution of a case.
+    """The reference solution of a case.
 
     Args:
         values: approach, m, and forces, N, pressures, Pa, and areas, m², of the condyles.
-        grids_mm: cell sizes, mm.
+        uncertainty: uncertainty of each value, in the same unit.
+        grids_mm: cell sizes of the solved grids, mm.
         solved: grid, as "fe 1 mm" -> its values.
         map: "i j" -> pressure, Pa, of the finest finite-element grid on a raster of 1 mm.
     """

@@ -56,8 +56,8 @@ class Tangent:
 class SourceNetwork(Solid):
     """Springs of equal stiffness, linear or with the material's curve; see `Solid`.
 
-    Cells (c, 8) are needed only for the strains that decide on flags; `springs` (s, 2) are end
-    nodes.
+    Cells (c, 8) are needed only for the strains that decide on flags. The material's Poisson's
+    ratio has no effect. `springs` (s, 2) are end nodes.
     """
 
     def __init__(

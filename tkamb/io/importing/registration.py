@@ -41,10 +41,9 @@ class RegistrationSettings:
     max_frames: int = 320
     """Largest number of frames of all trials. Not studied; c makes more frames worthless."""
     independent: float = 8.0
-    """Number of independent observations in all frames (an eighth of a stride each). The stated
-    deviations then contain the truth as often as they should in synthetic walks
-    (tests/test_registration.py).
-    """
+    """Number of independent observations in all frames: skin moves alike in each stride, and over
+    some eighth of it. Chosen such that the stated deviations contain the truth as often as they
+    should in synthetic walks (tests/test_registration.py)."""
     marker: float = 15.0 * MILLIMETRE
     """m: scale τ of a marker's distance from the model's position in each direction. Not studied:
     hands place markers to about this accuracy."""

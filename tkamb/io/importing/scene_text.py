@@ -78,6 +78,7 @@ class MarkerFile:
 
     Args:
         axes: axes of the file that point forward, up and right.
+        method: fit of the markers, "segments" or "chain".
         knee: joint of the chain, "hinge" or "free".
         interval: start and end, s; None: the whole recording.
         frames: number of frames at equal intervals; None: all frames of the recording.
@@ -177,7 +178,7 @@ class ImportRequest:
     """The files and options of an import. None: the option is inferred or not used.
 
     Args:
-        side: "left" or "right".
+        side: side of the knee, "left" or "right".
         recording: .c3d or .trc file of markers, or .mot or .sto file of the model's coordinates.
         grf: table of ground reactions, used instead of a C3D file's plates.
         grf_force: names of the foot's forces in the table `grf`, separated by commas. A force's
@@ -196,8 +197,12 @@ class ImportRequest:
         scale_mass: whether the model's masses are scaled to the subject's mass.
         method: method of fitting the markers, "segments" or "chain".
         cutoff_Hz: cut-off frequency of the low-pass filter of markers and plates.
+        activity: activity whose published peaks the report shows; None: no peaks.
         prefix: prefix of the markers to use, if a label occurs with several prefixes.
-        muscles: whether all muscles share the load, or only the quadriceps.
+        muscles: whether all muscles of the model share the load; otherwise only the quadriceps.
+        cycle: times of 0 and 100 % of the gait cycle, s; "plates": two foot strikes on the plates.
+        units: units that the user states because the file of the recording does not.
+        straight_ligaments: whether the surfaces that ligaments wrap are left out.
     """
 
     model: Path

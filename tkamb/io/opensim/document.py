@@ -194,9 +194,10 @@ class Document:
 
 
 def _number_words(text: str, count: int | None) -> list[str]:
-    """Split a list of numbers, like OpenSim's reader also `(0 1 0)`, `~[0,1,0]` and `0, 1, 0`.
+    """Split a list of numbers into words.
 
-    Commas that do not give `count` numbers may be decimal commas.
+    Like OpenSim's reader, this function also splits `(0 1 0)`, `~[0,1,0]` and `0, 1, 0`. Commas
+    separate numbers only if they give `count` numbers. Otherwise they may be decimal commas.
     """
     if count is None or count < 2:
         return text.split()

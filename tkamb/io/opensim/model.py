@@ -380,7 +380,12 @@ class Marker:
 
 @dataclass(frozen=True)
 class Unread:
-    """An element of the file that could not be read."""
+    """An element of the file that could not be read.
+
+    Args:
+        kind: the file's class.
+        concerns: names of the bodies and coordinates that occur in the element.
+    """
 
     kind: str
     name: str

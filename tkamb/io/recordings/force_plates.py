@@ -83,7 +83,7 @@ class PressureRange:
 
     @property
     def usual(self) -> bool:
-        """Whether a foot on the plate has such centres of pressure."""
+        """Whether the centres of pressure are those of a foot on the plate."""
         return not self.beside and bool((self.origin > MOVING).any())
 
 

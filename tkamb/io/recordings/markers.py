@@ -28,8 +28,8 @@ def plain_label(label: str) -> str:
 def matched_labels(names: Iterable[str], labels: Iterable[str]) -> dict[str, str]:
     """Return name -> label in the recording, for each name with a match.
 
-    A name matches an equal label, or else the only label with the same `plain_label` (not of two
-    subjects).
+    A name matches an equal label, or else the only label with the same `plain_label`. There is no
+    match if several labels have the same `plain_label` (two subjects).
     """
     labels = list(labels)
     plain: dict[str, list[str]] = {}

@@ -168,11 +168,12 @@ def share_load(problem: LoadSharing) -> Shared:
 
 
 def kkt_residual(problem: LoadSharing, shared: Shared) -> float:
-    """Return the largest relative violation of the Karush-Kuhn-Tucker conditions.
+    """Return the largest relative violation of the optimality conditions.
 
-    Stationarity (gradient plus multipliers is zero) is relative to the largest term of the
-    gradient. Complementarity means that multiplier times distance from the bound is zero;
-    feasibility is the third.
+    The conditions (Karush, Kuhn and Tucker) are stationarity, feasibility and complementarity.
+    Stationarity means that gradient plus multipliers is zero. Its violation is relative to the
+    largest term of the gradient. Complementarity means that multiplier times distance from the
+    bound is zero.
     """
     a, y = shared.activation, shared.others
     slope = problem.gradient(a)
@@ -253,6 +254,7 @@ class EmgGuide:
     Args:
         envelope: normalised envelopes, (f, m); NaN for muscles without EMG.
         use: "target" or "bounds".
+        size: weight W or width.
     """
 
     envelope: Array

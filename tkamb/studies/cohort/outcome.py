@@ -28,9 +28,12 @@ class PressureMap:
     """The pressure on the insert at one frame.
 
     Args:
+        frame: number of the frame among the computed frames of the run.
         points: map points in the insert frame, m, (n, 3).
         triangles: point numbers of the triangles between them, (k, 3).
         pressure: contact pressure at the points, Pa, (n,).
+        side: side of the knee, "right" or "left".
+        lateral: direction of the insert's z axis, "lateral" or "medial".
     """
 
     frame: int

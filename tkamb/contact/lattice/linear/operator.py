@@ -37,7 +37,7 @@ class MemoryNeedSettings:
     """The estimate of the memory that a lattice needs."""
 
     unknowns_per_node: int = 3
-    """Held unknowns are counted, too."""
+    """Unknowns of a node. By definition; held unknowns are counted too."""
     cell_bytes: int = 20_000
     """Bytes for a cell during the assembly of the stiffness. Measured: 9 to 22 kB, which
     `safety_factor` covers."""
@@ -64,6 +64,7 @@ class TooLittleMemoryError(ComputationError):
 
     Args:
         need: memory for the next step, bytes.
+        available: available memory, bytes.
         likely: expected memory for the whole computation, bytes; 0: as much as `need`.
     """
 
@@ -87,13 +88,14 @@ class TooLittleMemoryError(ComputationError):
 
 
 def check_memory(need: float, likely: float = 0.0) -> None:
-    """Raise unless the `need` (bytes) of the next step is available.
+    """Raise an error if the available memory is too small.
 
     Args:
+        need: memory for the next step, bytes.
         likely: expected memory for the whole computation, bytes; for the advice.
 
     Raises:
-        TooLittleMemoryError: it is not available.
+        TooLittleMemoryError: the available memory is too small.
     """
     available = available_memory()
     if MEMORY_NEED.safety_factor * need > available:
@@ -103,7 +105,7 @@ def check_memory(need: float, likely: float = 0.0) -> None:
 
 
 def check_assembly_memory(cells: int) -> None:
-    """Raise unless the stiffness of the cells can be assembled.
+    """Raise an error if the memory is too small to assemble the stiffness of the cells.
 
     Raises:
         TooLittleMemoryError: the available memory is too small.
