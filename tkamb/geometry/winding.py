@@ -7,16 +7,16 @@ above the point:
 
 It is 1 inside a body, 0 outside and in a void, and 2 where two bodies of one file overlap. The two
 sides of a wall between touching bodies change it by -1 and +1, so the wall does not count. The
-parity of crossings would be wrong for walls, overlaps and voids with wrong winding.
+parity of the crossings would be wrong for voids with wrong winding, overlaps and walls.
 
-Positions in the plan view are integers (`PlanGrid`, steps of about 1e-10 m). The signs of areas
-that decide whether a ray passes through a triangle are therefore exact, also at edges and vertices.
-A ray that meets an edge exactly is moved by an infinitesimal distance to +z, and by a much smaller
-one to +x (simulation of simplicity, Edelsbrunner & Muecke, ACM Trans Graph 9:66 (1990),
-doi:10.1145/77635.77639).
+Positions in the plan view are integers (`PlanGrid`, steps of about 1e-10 m). The signs of the areas
+that decide whether a ray passes through a triangle are therefore exact and consistent at edges and
+vertices. A ray that meets an edge exactly is moved by an infinitesimal distance to +z, and by a
+much smaller one to +x (simulation of simplicity, Edelsbrunner & Muecke, ACM Trans Graph 9:66
+(1990), doi:10.1145/77635.77639). The result is correct for all points off the surface.
 
 In a closed surface the sum over the triangles below, with the opposite sign, is equal. If a ray
-leaves through a small hole, the larger sum is the result.
+leaves through a small hole of the mesh, the larger sum is the result.
 """
 
 from dataclasses import dataclass

@@ -2,14 +2,14 @@
 
 A taut line runs from the shank at p to the thigh or pelvis at q, both ends fixed to their links. A
 force F pulls the shank at p along u = (q - p)/|q - p|, and the thigh at q along -u. Foot and shank
-are one body. The force of a line from the pelvis acts on the femur, and the hip loads balance it.
+are one body: a line that ends on the foot pulls it where the line leaves the foot. The force of a
+line from the pelvis acts on the femur, and the hip loads balance it.
 
-With fixed contact points and lines the equations are linear in all loads (docs/muscles.md), which
-has two uses:
+With fixed contact points and lines the equations are linear in all loads. This has two uses.
 
 1. The tension Q of the extensor group is linear in the forces F_i of the other muscles and in a
-  moment r on the tibia about the insert's z. Solved for r, this is the knee's row of a static
-  optimisation (`flexion_row`),
+   moment r on the tibia about the insert's z (docs/muscles.md). Solved for r, this is the knee's
+   row of a static optimisation (`flexion_row`),
 
        -Q_0/h = -(1/h) Q + sum_i (g_i/h) F_i + r.
 
@@ -21,9 +21,10 @@ has two uses:
 
        N_side = N_side(weight, inertia and ground) + N_side(ligaments) + sum_i N_side(muscle i),
 
-plus N_side(post) if a cam on the insert's post is modelled. Each term has all other muscles and
-ligaments at zero force. A moment about the insert's z balances its flexion moment, and these
-moments add up to the knee's reserve.
+   plus N_side(post) if a cam on the insert's post is modelled. Each term has all other muscles and
+   ligaments at zero force, and a moment about the insert's z balances its flexion moment; over all
+   terms these moments add up to the knee's reserve. As in every frame, residuals balance the AP and
+   ML force and the axial moment. The extensor group is one muscle here.
 
 References: Winby et al., J Biomech 42:2294 (2009), doi:10.1016/j.jbiomech.2009.06.019;
 Sasaki & Neptune, J Biomech 43:2780 (2010), doi:10.1016/j.jbiomech.2010.06.011.

@@ -19,16 +19,20 @@ displacement is
 
 Elliptic integrals give the part of a half-space (L = 1), quadrature gives the part of L - 1.
 
-F is the load, d the approach, E Young's modulus and nu Poisson's ratio.
+Reference: Johnson, Contact Mechanics (1985), sections 3.4 and 5.8.
+
+The formulas are independent of the models' code. F is the load, d the approach, E Young's modulus
+and nu Poisson's ratio.
 
 - plate: a rigid flat plate on a block of height h and area A with nu = 0. The stress is F/A
-  everywhere, the approach d = h eps(F/A), with the material's curve eps(sigma) = sigma/E + alpha
-  (sigma0/E) (sigma/sigma0)^n. A model is exact on any grid while the plastic strain is small; a
-  large one widens the block, which the fixed bottom resists. A column of an elastic foundation
-  follows p = sigma(-ln(1 - d/h)), so its approach is d = h (1 - exp(-eps)).
-- slide: the plate on a mobile bearing, for any nu and strain. Two held nodes of the bottom stiffen
-  the block by up to 2 %.
-- kept: the plate with an operator cache that contains the operator of another modulus.
+  everywhere. The approach is d = h eps(F/A), with the material's curve eps(sigma) = sigma/E +
+  alpha (sigma0/E) (sigma/sigma0)^n. A model is exact on any grid while the plastic strain is small.
+  Large plastic strain widens the block, which the fixed bottom resists. A column of an elastic
+  foundation follows p = sigma(-ln(1 - d/h)), so its approach is d = h (1 - exp(-eps)).
+- slide: the plate on a mobile bearing, for any nu and strain. Two nodes of the bottom are fixed
+  to prevent rigid motion. This stiffens the block by up to 2 %.
+- kept: the plate with the operator cache on disk, which already contains the operator of another
+  modulus. Each modulus must have its own operator.
 - layer: a rigid sphere on a linear layer bonded to a rigid base (`sphere_on_layer`).
 - bed: a paraboloid on a bed of springs of pressure p(e), F = 2 pi R h int_0^(d/h) p(e) de.
 - hertz: the sphere on a half-space, a³ = 3 F R / (4 E*), d = a²/R, p0 = 3 F / (2 pi a²).

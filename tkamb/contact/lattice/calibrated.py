@@ -7,14 +7,15 @@ the springs of the whole lattice are
     edges            k_x  = V/a² (3 - a²/b² - a²/c²) + 4 k_b a²/L², cyclic
     body diagonals   k_b, free between bounds
 
-A uniform strain then stores the energy of an isotropic solid with lambda = mu (docs/lattice.md has
-all equations). The deviatoric stiffness of a cell of any shape is
+A cell owns a quarter of each edge, half of each face diagonal and all of its body diagonals.
+A uniform strain then stores the energy of an isotropic solid with lambda = mu
+(docs/lattice.md). The deviatoric stiffness of a cell of any shape is
 
     K_d = V B̄ᵀ (2 I_dev) B̄ + Pᵀ K_spr P
 
-Here B̄ gives the strain of the cell's mean displacement gradient, and I_dev its deviatoric part. P
-subtracts the linear field of this gradient. K_spr is the matrix of the springs. So the patch test
-is exact for sheared cells too.
+B̄ gives the strain of the cell's mean displacement gradient, and I_dev its deviatoric part. P
+subtracts the linear field of this gradient from the displacement. K_spr is the matrix of the
+springs. So the patch test is exact for sheared cells too.
 """
 
 from collections.abc import Iterator

@@ -25,7 +25,9 @@ approach, because an error du = e u leaves r = e K_T u. The load and lambda >= 0
 every pass.
 
 After `max_passes`, an iteration that began with the loads of an earlier solution begins again
-without them; any other continues with `solve_by_newton`, which is also the reference.
+without them; any other continues with `solve_by_newton`. This full Newton iteration is also the
+reference: every step factorises the tangent stiffness and solves the contact on its compliance. The
+two share only the contact conditions.
 """
 
 from dataclasses import dataclass, replace

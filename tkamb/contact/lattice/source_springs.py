@@ -5,8 +5,9 @@ Young's modulus E in the superior-inferior direction. 13 springs belong to the v
 
     C_ijkl = (k/V) sum over 13 springs of L² n_i n_j n_k n_l,   k = E / (E at k = 1)
 
-(Sharma's sum has 26 springs per cell and counts each twice). docs/lattice.md has its values on
-cubes. Poisson's ratio is 0.35 for every material.
+(Sharma's sum has 26 springs per cell and counts each twice). On a cube of edge a, k = E a/2.7.
+Poisson's ratio is 0.35 for every material. Springs on the surface have the same k although fewer
+cells share them, so that a part with free sides is too stiff.
 
 Nonlinear: the force is f = sigma(eps) C L0 along the deformed spring, with eps from its length.
 Source: Sharma, PhD dissertation, University of Tennessee (2008), sections 4.5.1 to 4.5.3.

@@ -4,16 +4,18 @@ The filter is the quintic smoothing spline: the function s that minimises
 
     sum_i w_i (x_i - s(t_i))^2 + lambda * integral (s''')^2 dt,     lambda = (2 pi f_c)^-6
 
-with w_i the spacing of the samples. Away from the ends its frequency response is 1 / (1 + (f /
-f_c)^6), that of a third-order Butterworth filter run forwards and backwards: one half at the
-cut-off f_c, no phase shift. Unlike that filter, it accepts uneven samples, and its first and second
-derivatives belong to one smooth curve.
+with w_i the spacing of the samples. Away from the ends its frequency response is
+1 / (1 + (f / f_c)^6), that of a third-order Butterworth filter run forwards and backwards: one half
+at the cut-off f_c, no phase shift. Unlike that filter, it accepts uneven samples, and its first and
+second derivatives belong to one smooth curve. Polynomials of degree two pass unchanged.
 
-The ends are natural, without padding, unless `periodic=True` closes the curve: the last sample is
-then the first one of the next cycle. Example: a 1 Hz wave with a cut-off of 6 Hz. The root mean
-square error of its acceleration, as a share of the amplitude, is 0.23 at an end. At a quarter, a
-half and one period of the cut-off from it, it is 0.06, 0.013 and 0.002. A two-pass Butterworth
-filter with reflected ends has 0.64, 0.16, 0.11 and 0.02.
+The ends are natural; samples are not padded. Example: a 1 Hz wave with a cut-off of 6 Hz. The root
+mean square error of its acceleration, as a share of the amplitude, is 0.23 at an end. At a distance
+of a quarter, a half and one period of the cut-off it is 0.06, 0.013 and 0.002. A two-pass
+Butterworth filter with reflected ends has errors of 0.64, 0.16, 0.11 and 0.02 at these places.
+
+`periodic=True` closes the curve: the last sample is the first one of the next cycle, and there are
+no ends.
 
 `cutoff_Hz = "none"` interpolates the samples with a quintic spline.
 
@@ -22,8 +24,8 @@ References:
     Craven & Wahba, Numer Math 31:377 (1979), doi:10.1007/BF01404567.
 
 The deviation of a sample is its distance from the cubic through its two neighbours on either side.
-It is odd if it exceeds `floor` and many times the median deviation around it: noise raises this
-median, a single odd sample hardly changes it.
+A sample is odd if its deviation exceeds `floor` and many times the median deviation around it.
+Noise is therefore not odd: it raises the median, which a single odd sample hardly changes.
 """
 
 import math

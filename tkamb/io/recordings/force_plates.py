@@ -13,19 +13,19 @@ channels give the force and the moment about the transducers' origin in these ax
     type 5   as type 2 after a calibration matrix (6, 8) of eight channels
 
 A calibration matrix gives forces in N (or FORCE_PLATFORM:UNITS) and moments in that unit times
-POINT:UNITS. A type 4 plate may state other units. The units that put the centre of pressure on the
-plate are then used.
+POINT:UNITS. The channels of a type 4 plate may state other units. The units that put the centre of
+pressure on the plate are then used.
 
-ORIGIN is the vector o from the transducers' origin to the surface's centre, about which the moment
-is M - o × F.
+ORIGIN is the vector o from the transducers' origin to the centre of the surface. The moment about
+this centre is M - o × F. The centre of pressure is not returned: it needs a force threshold.
 
-The mean of each channel over the frames of FORCE_PLATFORM:ZERO is subtracted, unless the plate is
-loaded in them.
+FORCE_PLATFORM:ZERO names frames without load. The mean of each channel over these frames is
+subtracted, unless the plate is loaded in them.
 
 Source: C3D user guide, FORCE_PLATFORM; Kistler's formulae for four three-component sensors.
 
-If the unit of length of its moments or points is wrong, the centre of pressure leaves the surface,
-or it rests at the transducers' origin as no foot does.
+A plate states its moments, or its points, in a unit of length. If this unit is wrong, the centre of
+pressure leaves the surface, or it rests at the transducers' origin as no foot does.
 """
 
 import logging

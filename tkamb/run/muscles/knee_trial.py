@@ -1,18 +1,20 @@
 """Static optimisation for a leg with tkamb's knee in place of the OpenSim model's knee.
 
-The OpenSim model provides the rows of hip, ankle and subtalar joint. In each frame tkamb's knee
-provides its own row: the moment and the moment arms (`tkamb.knee.crossing`).
+The OpenSim model provides the rows of hip, ankle and subtalar joint. In each frame the equations of
+tkamb's knee provide the row of the knee: the moment, the moment arm of the extensor group and the
+moment arms of the muscles that cross the knee (`tkamb.knee.crossing`). `LegRecording` names the
+files of model, motion and ground reaction. `load_knee_trial` reads them.
 
-Let W be the wrench on the shank of all loads but contact, about a point at the height of the
-contact. With the condyles' contact points at z_m and z_l, superior-inferior force and frontal
-moment give
+Contact, ligaments, muscles, patellar ligament and the load from outside balance on the shank. Let
+W be the wrench of all loads but contact, about a point at the height of the contact. With the
+condyles' contact points at z_m and z_l, superior-inferior force and frontal moment give
 
     N_m + N_l = W_y,    z_m N_m + z_l N_l = -W_x,   W_x: moment about AP.
 
-W is affine in the muscle forces, and so are N_m and N_l. With the flexion moment alone the optimum
-lets a condyle lift off as soon as the load from outside allows it. Measured knees do not: the
-medial condyle carries 60 to 80 % of the load in walking (PMC2965044, with references). With a least
-share s of each condyle, the optimisation has two more rows,
+W is affine in the forces of the muscles, and so are N_m and N_l. A static optimisation that knows
+only the flexion moment lets a condyle lift off as soon as the load from outside allows it. Measured
+knees do not: the medial condyle carries 60 to 80 % of the load in walking (PMC2965044, with
+references). With a least share s of each condyle, the optimisation has two more rows,
 
     N_side - s (N_m + N_l) >= 0.
 

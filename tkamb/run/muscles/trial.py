@@ -5,21 +5,25 @@ In each frame,
     τ_c = Σ_i R_ci (a_i F_i + P_i) + r_c.
 
 τ are the generalised forces of the motion (inertia, gravity, external loads), and R = -dL/dq the
-moment arms about the balanced coordinates c. F_i is a muscle's force at full activation, P_i its
-passive force. The reserve r_c is the moment that the muscles lack. Activations a and reserves
-minimise, with w, p and the reserve sizes ρ of `Sharing`,
+moment arms of the muscle lines about the balanced coordinates c. F_i is a muscle's force at full
+activation, and P_i its passive force. The reserve r_c is the moment that the muscles lack.
+Activations a and reserves minimise, with w, p and the reserve sizes ρ of `Sharing`,
 
     Σ_i w_i a_i^p + Σ_c (r_c / ρ_c)²,   lowest <= a_i <= highest.
 
-A taut line is a chain of straight parts between points on bones and on their wrap objects. The ends
-of its parts on a bone are its effective attachments. A part from bone A at p to bone B at q pulls A
-at p along u = (q - p)/|q - p|, and B at q along -u. The virtual work of the wrenches w on the bones
-gives the moment arm,
+By the chain rule, a dependent coordinate contributes to τ and R of its coupler's independent
+coordinate.
+
+A taut muscle line is a chain of straight parts between points on bones and on their wrap objects.
+A part from bone A at p to bone B at q pulls A at p along u = (q - p)/|q - p|, and B at q along -u.
+The ends of the parts that leave a bone are the effective attachments of the line. The virtual work
+of the wrenches w on the bones gives the moment arm,
 
     Σ_bones J_boneᵀ w_bone = -dL/dq.
 
-A wrap object that a point inside it displaces (docs/opensim.md) pushes on its bone, too. Path
-points that move within their bone (quadriceps of gait2392) do work without a wrench on any bone.
+Two effects add to the moment arm. A wrap object that is displaced by a point inside it
+(docs/opensim.md) pushes on its bone. Path points that move within their bone (quadriceps
+of gait2392) do work without a wrench on any bone.
 """
 
 from collections.abc import Mapping, Sequence
