@@ -276,6 +276,10 @@ def test_condyles_and_post_together_balance_the_shank(knee, released, k):
     tibia, femur = geometry.post
     middle = np.array([0.01, 0.02, 0.03])
     assert total_wrench([tibia], middle) == pytest.approx(-total_wrench([femur], middle))
+    row = frame_row(knee.case, k, frame, {}, "ok")
+    pushed = [row["post_force_ap_N"], -row["post_force_si_N"], row["post_force_ml_N"]]
+    tangential = total_wrench([tibia], middle)[:3] - pushed  # by Coulomb's law
+    assert 0.0 < np.linalg.norm(tangential) < 1.001 * friction * row["post_force_N"]
     shank = [load for load in geometry.ligaments if load.link.startswith("tibia")]
     total = external_wrench(geometry, geometry.coordinates)
     total = total + total_wrench([*shank, tibia], np.zeros(3))

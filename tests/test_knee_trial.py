@@ -12,6 +12,7 @@ from tkamb.io.importing.anatomy import find_leg
 from tkamb.io.importing.links import find_links
 from tkamb.io.opensim.motion import CoordinateMotion
 from tkamb.io.recordings.meshes import axes_rotation, load_surface
+from tkamb.io.recordings.recording_tables import GroundReactionTable
 from tkamb.run.muscles import Sharing
 from tkamb.run.muscles.knee_trial import LegRecording, knee_trial, load_knee_trial
 from tkamb.run.muscles.trial import trial_problems
@@ -102,6 +103,22 @@ def walked(names, time, left):
     return result | {"pelvis_tx": 1.2 * time, "pelvis_ty": 0.95 + 0.02 * np.sin(9 * time)}
 
 
+def pushed_up(path, time, left):
+    """Return the table of a made-up ground reaction, or of its image in the sagittal plane."""
+    z = -1.0 if left else 1.0
+    values = {
+        "force_1": 80.0 * np.sin(3 * time),
+        "force_2": np.full_like(time, 700.0),
+        "force_3": z * 30.0 * np.cos(4 * time),
+        "point_1": 1.2 * time,
+        "point_2": np.zeros_like(time),
+        "point_3": z * (0.1 + 0.02 * time),
+    }
+    write_storage(path, {"time": time} | values, in_degrees=False)
+    columns = {name: name for name in ("time", *values)}
+    return GroundReactionTable(file=path, columns=columns, length_unit="m", cutoff_Hz=6.0)
+
+
 def test_the_left_leg_of_a_symmetric_model_is_the_mirror_image_of_the_right(tmp_path):
     """A mirrored motion gives the same moments, arms and strengths, and mirrored lines."""
     time, result = np.linspace(0.0, 1.0, 41), {}
@@ -111,7 +128,8 @@ def test_the_left_leg_of_a_symmetric_model_is_the_mirror_image_of_the_right(tmp_
         columns = {"time": time} | walked(names, time, side == "left")
         write_storage(path, columns, in_degrees=False)
         mesh = {"insert_placement": None, "mesh_axes": "+x,+y,+z"}
-        options = {"markers": None, "laboratory_axes": "+x,+y,+z", "cutoff": 6.0, "ground": None}
+        options = {"markers": None, "laboratory_axes": "+x,+y,+z", "cutoff": 6.0}
+        options["ground"] = pushed_up(tmp_path / f"{side}_ground.mot", time, side == "left")
         recording = LegRecording(
             PUBLISHED["Rajagopal2016"], side, path, **options, **mesh, sharing=Sharing()
         )

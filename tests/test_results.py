@@ -165,6 +165,19 @@ def test_a_failed_frame_is_nan_in_the_maps(tmp_path):
     assert np.isnan(maps.nodal_force_N[1]).all()
 
 
+def test_an_error_of_hdf5_without_a_number_is_one_line(tmp_path, monkeypatch):
+    def full(dataset, size, axis):
+        raise RuntimeError("no space left\nthe state of the library")
+
+    writer = MapWriter(tmp_path / "contact.h5", np.zeros((4, 3)), [[0, 1, 2]], {})
+    writer.append(0.0, np.ones(4), np.zeros(4), np.zeros((4, 3)), np.eye(4))
+    with monkeypatch.context() as patch:
+        patch.setattr(h5py.Dataset, "resize", full)
+        with pytest.raises(InputError, match=r"cannot be written \(no space left\)"):
+            writer.flush()
+    writer.close()
+
+
 WRITER = """
 import sys, numpy as np
 from tkamb.run.maps import MapWriter

@@ -141,4 +141,6 @@ def test_slsqp_has_the_same_optimum(seed, exponent):
     )
     assert other.success
     np.testing.assert_allclose(solution.activation, other.x, atol=2e-5)
-    assert problem.cost(solution.activation) <= other.fun * (1 + 1e-9)
+    a, reserves = solution.activation, problem.others(solution.activation) / problem.reserve
+    assert problem.cost(a) <= other.fun * (1 + 1e-9)
+    assert problem.cost(a) == pytest.approx(problem.weight @ a**exponent + reserves @ reserves)
