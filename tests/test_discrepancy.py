@@ -1,5 +1,7 @@
 """Model discrepancy: fit to trials, band with samples, and sentence in the summary."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -91,6 +93,13 @@ def test_only_the_bias_of_the_same_activity_shifts_a_band():
     assert squat.mean == pytest.approx(-0.375, abs=0.05)  # 3/4 of the mean bias
     assert other.mean == 0.0 and other.deviation > squat.deviation
     assert fitted(trials, "medial", "squat") is None
+
+
+def test_a_fit_to_more_independent_frames_has_more_degrees_of_freedom():
+    error, _, _, _ = one_trial(np.random.default_rng(5), bias=0.1, scatter=0.4)
+    lengths = [replace(error, independent_frames=n) for n in (3.0, 10.0, 100.0)]
+    freedoms = [fitted([one], "total", "walking").freedom for one in lengths]
+    assert freedoms == sorted(freedoms) and freedoms[-1] > 1.05 * freedoms[0]
 
 
 def test_a_band_with_discrepancy_is_never_negative_and_nan_without_samples():

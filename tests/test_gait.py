@@ -15,6 +15,7 @@ from tkamb.io.recordings.gait_cycle import cycle_percent, find_gait
 from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.run.plausibility.ground import step_questions
+from tkamb.run.summary import _gait
 from tkamb.show.axis import horizontal_axis
 from tkamb.show.panels import panels
 from tkamb.show.plots import Sheet
@@ -39,6 +40,19 @@ def test_gait_events_are_where_the_force_crosses_the_threshold():
     np.testing.assert_allclose(gait.foot_strikes, [0.4 + late, 1.5 + late], atol=1e-9)
     np.testing.assert_allclose(gait.toe_offs, [1.05 - late, 2.15 - late], atol=1e-9)
     assert gait.cycle(0.3, 2.5) == pytest.approx((0.4 + late, 1.5 + late))
+
+
+def test_toe_off_is_in_per_cent_of_its_cycle():
+    """Both thresholds are crossed 0.05 s x 20/700 inside the stance; a stride takes 1.1 s."""
+    time = np.arange(0.0, 3.0, 1 / RATE_HZ)
+    gait = find_gait(time, vertical(time, [(0.4, 1.05), (1.5, 2.15)]))
+    case = SimpleNamespace(
+        gait_cycle_s=gait.cycle(0.3, 2.5),
+        motion=SimpleNamespace(cycle_percent=None),
+        ground=SimpleNamespace(gait=gait),
+    )
+    expected = 100.0 * (1.05 - 0.4 - 2 * 0.05 * 20.0 / 700.0) / 1.1
+    assert _gait(case)["gait"]["toe_off_percent"] == pytest.approx([expected])
 
 
 def test_a_recording_that_begins_on_the_plate_has_no_first_strike():
