@@ -1,5 +1,6 @@
 """Contradictory estimates of the split are flagged; sensitivity of the split to adduction."""
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from tkamb.io.scene import load_scene
 from tkamb.io.scene.case import load_case
 from tkamb.knee.adjustment import split_sensitivity, split_tangent
 from tkamb.run.read_scene import recording_of
-from tkamb.run.status import contradictions
+from tkamb.run.status import contradictions, split_determined
 from tkamb.show.axis import horizontal_axis
 from tkamb.show.headline import cards
 from tkamb.studies.cases import change_recording
@@ -47,6 +48,14 @@ def test_split_sensitivities_by_tangent_and_by_presses_agree_on_the_shipped_knee
         turned = split_sensitivity(Probe(contact.model, contact.state), frame.contact)
         assert frame.sensitivity == pytest.approx(turned, rel=0.03)
         assert frame.sensitivity != turned
+
+
+@pytest.mark.parametrize(("moved", "determined"), [(0.24, 1.0), (-0.24, 1.0), (0.26, 0.0)])
+def test_half_a_degree_may_shift_a_quarter_of_the_load(tmp_path, moved, determined):
+    recording = recording_of(load_case(load_scene(write_scene(tmp_path, **COARSE))))
+    frame = recording.frame(60)
+    sensitivity = moved * frame.loads.contact_force[1] / np.radians(0.5)
+    assert split_determined(replace(frame, sensitivity=sensitivity)) == determined
 
 
 @pytest.mark.parametrize("name", ["foundation-linear", "lattice-linear"])
