@@ -174,14 +174,7 @@ def test_derivatives_of_the_forces(plain, open_knee, frame):
 def test_knee_and_patella_are_in_equilibrium_together(plain, knee, released, frame):
     """Residuals of both, at one pose and one tension, are below 1e-6 of the quadriceps."""
     found = knee.equilibrium(*state(plain, frame), released=released)
-    assert not found.failed, found.reason
-    quadriceps = found.loads.quadriceps
-    assert found.residual <= 1e-6 * quadriceps
-    alone = knee.patella_equilibrium(found.q, found.loads.tensions)
-    assert alone.residual <= 1e-6 * quadriceps
-    # The equations at that pose agree with the search about the tension.
-    tension = found.search.geometry.extensor.released.tension
-    assert quadriceps == pytest.approx(tension, rel=1e-5)
+    quadriceps = common_tension(knee, found, 1e-6, 1e-5)
     # The residuals of the released coordinates vanish in the equations, too.
     residuals = found.loads.residuals
     if "ap" in released:
@@ -192,13 +185,22 @@ def test_a_patella_on_a_jump_of_its_contact_has_an_equilibrium(plain, knee):
     """The tension cannot agree to 1e-7 where the force of the button jumps from facet to facet."""
     *_, jumping = random_states(plain, knee, False, 20)
     found = jumping.equilibrium()
+    common_tension(knee, found, 1e-4, 1e-4)
+
+
+def common_tension(knee, found, residual, rel):
+    """Assert residuals of knee and patella relative to the quadriceps' tension, and return it.
+
+    The equations at that pose agree with the search about the tension.
+    """
     assert not found.failed, found.reason
     quadriceps = found.loads.quadriceps
-    assert found.residual <= 1e-4 * quadriceps
+    assert found.residual <= residual * quadriceps
     alone = knee.patella_equilibrium(found.q, found.loads.tensions)
-    assert alone.residual <= 1e-4 * quadriceps
+    assert alone.residual <= residual * quadriceps
     tension = found.search.geometry.extensor.released.tension
-    assert quadriceps == pytest.approx(tension, rel=1e-4)
+    assert quadriceps == pytest.approx(tension, rel=rel)
+    return quadriceps
 
 
 def test_the_pose_of_the_knee_and_the_patella_depend_on_each_other(plain, knee):
